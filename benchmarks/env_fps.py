@@ -1,0 +1,134 @@
+"""Steps per second of every id, alone and 32 in one process, on one core, beside memory-gym's where installed.
+
+    python benchmarks/env_fps.py [--seconds S] [--num-envs N] [--ids ID ...]
+
+Prints a Markdown table. Actions are random, resets included. memory-gym is optional: without it, its columns are empty.
+The measurements of the two packages take turns, and each column shows the best of its rounds, because machines are
+noisy. Ratios are what to quote.
+"""
+
+import argparse
+import importlib
+import os
+import sys
+import time
+import warnings
+from pathlib import Path
+
+os.environ.update(SDL_VIDEODRIVER="dummy", SDL_AUDIODRIVER="dummy", PYGAME_HIDE_SUPPORT_PROMPT="1")
+# One core means one thread.
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import gymnasium as gym
+
+# memory-gym's classes, from their modules: its ids are ours.
+ORIGINALS = {
+    "MortarMayhem-v0": ("mortar_mayhem", "MortarMayhemEnv"),
+    "MortarMayhem-Grid-v0": ("mortar_mayhem_grid", "GridMortarMayhemEnv"),
+    "MortarMayhemB-v0": ("mortar_mayhem_b", "MortarMayhemTaskBEnv"),
+    "MortarMayhemB-Grid-v0": ("mortar_mayhem_b_grid", "GridMortarMayhemTaskBEnv"),
+    "Endless-MortarMayhem-v0": ("endless_mortar_mayhem", "EndlessMortarMayhemEnv"),
+}
+COLUMNS = ["id", "memory-gym", "one", "ratio", "{n} lanes", "ratio", "reset, memory-gym", "reset", "ratio"]
+ACTIONS = 256  # sampled before the clock starts
+
+
+def original_classes() -> dict[str, type]:
+    """memory-gym's environment classes by id; empty where it is not installed."""
+    try:
+        return {id_: getattr(importlib.import_module(f"memory_gym.{m}"), c) for id_, (m, c) in ORIGINALS.items()}
+    except ImportError:
+        return {}
+
+
+def single_rate(env, seconds: float) -> float:
+    """Steps per second of one environment, resets included."""
+    actions = [env.action_space.sample() for _ in range(ACTIONS)]
+    env.reset(seed=1)
+    steps, start = 0, time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+        steps += ACTIONS
+    return steps / (time.perf_counter() - start)
+
+
+def vector_rate(envs, seconds: float) -> float:
+    """Steps per second of all lanes together, automatic resets included."""
+    actions = [envs.action_space.sample() for _ in range(ACTIONS)]
+    envs.reset(seed=1)
+    rounds, start = 0, time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        for action in actions[rounds % ACTIONS :][:16]:
+            envs.step(action)
+        rounds += 16
+    return rounds * envs.num_envs / (time.perf_counter() - start)
+
+
+def reset_rate(env, seconds: float) -> float:
+    """Resets per second of one environment."""
+    resets, start = 0, time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        env.reset()
+        resets += 1
+    return resets / (time.perf_counter() - start)
+
+
+def measure(id_: str, original: type | None, num_envs: int, seconds: float, rounds: int = 4) -> dict[str, float]:
+    """The best rate of every measurement over the rounds, in which the packages take turns."""
+    ours, lanes = gym.make(id_), gym.make_vec(id_, num_envs=num_envs)
+    theirs = original() if original else None
+    tasks = [("one", single_rate, ours), ("lanes", vector_rate, lanes), ("reset", reset_rate, ours)]
+    if theirs is not None:
+        tasks[1:1] = [("their one", single_rate, theirs), ("their reset", reset_rate, theirs)]
+    best: dict[str, float] = {}
+    for _ in range(rounds):
+        for name, rate, env in tasks:
+            best[name] = max(best.get(name, 0.0), rate(env, seconds / rounds))
+    ours.close()
+    lanes.close()
+    return best
+
+
+def row(id_: str, best: dict[str, float]) -> str:
+    """One line of the table. Resets are shown as microseconds each."""
+    their_one, their_reset = best.get("their one"), best.get("their reset")
+    cells = [f"`{id_}`", f"{their_one:,.0f}" if their_one else "", f"{best['one']:,.0f}"]
+    cells += [f"{best['one'] / their_one:.1f}" if their_one else "", f"{best['lanes']:,.0f}"]
+    cells += [f"{best['lanes'] / their_one:.1f}" if their_one else ""]
+    cells += [f"{1e6 / their_reset:,.0f} us" if their_reset else "", f"{1e6 / best['reset']:,.0f} us"]
+    cells += [f"{best['reset'] / their_reset:.1f}" if their_reset else ""]
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=2.0, help="time for each number (default: 2)")
+    parser.add_argument("--num-envs", type=int, default=32, help="lanes of the vector environment (default: 32)")
+    parser.add_argument("--ids", nargs="+", default=None, help="ids to measure (default: all)")
+    args = parser.parse_args()
+    if args.seconds <= 0 or args.num_envs < 1:
+        parser.error("--seconds and --num-envs must be positive")
+    warnings.filterwarnings("ignore")
+    originals = original_classes()
+    import memory_gym_envs  # after memory-gym, so that the ids are this package's
+
+    unknown = sorted(set(args.ids or []) - set(memory_gym_envs.IDS))
+    if unknown:
+        parser.error(f"no such id: {', '.join(unknown)}; the ids are {', '.join(memory_gym_envs.IDS)}")
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    print("Steps per second; random actions, one process, one core" + ("." if originals else "; no memory-gym here."))
+    print()
+    print(f"| {' | '.join(COLUMNS)} |".format(n=args.num_envs))
+    print("|---" + "|---:" * (len(COLUMNS) - 1) + "|")
+    for id_ in args.ids or memory_gym_envs.IDS:
+        print(row(id_, measure(id_, originals.get(id_), args.num_envs, args.seconds)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,25 @@
+"""Memory Gym's environments, batched: importing this package registers their ids with Gymnasium.
+
+`gym.make(id)` makes one environment, `gym.make_vec(id, num_envs=N)` N of them in one object.
+"""
+
+from gymnasium.envs.registration import register
+
+from memory_gym_envs.base import MemoryGymVectorEnv
+from memory_gym_envs.mortar_mayhem import MortarMayhem
+from memory_gym_envs.options import Option, options_table
+from memory_gym_envs.single import MemoryGymEnv
+
+__all__ = ["IDS", "MemoryGymEnv", "MemoryGymVectorEnv", "MortarMayhem", "Option", "options_table"]
+
+FAMILIES = (MortarMayhem,)
+IDS = tuple(variant for family in FAMILIES for variant in family.variants)
+
+for _family in FAMILIES:
+    for _id in _family.variants:
+        register(
+            id=_id,
+            entry_point="memory_gym_envs.single:MemoryGymEnv",
+            vector_entry_point=f"{_family.__module__}:{_family.__name__}",
+            kwargs={"variant": _id},
+        )

@@ -1,0 +1,306 @@
+"""The base class of every environment family: a batch of lanes behind Gymnasium's vector interface.
+
+A family says what its options, spaces, state, rules and pictures are; everything that Gymnasium asks of a vector
+environment (seeds, levels, options kept from reset to reset, same-step autoreset, infos, rendering) is here, once.
+Shape letters: N lanes (parallel environments), n some of them, G entries of the ground truth.
+"""
+
+import operator
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from memory_gym_envs.drawing import magnify
+from memory_gym_envs.options import resolve
+
+RENDER_MODES = ("rgb_array", "debug_rgb_array")
+DEBUG_ZOOM = 4  # the debug view is 336 x 336
+ALL = slice(None)  # every lane
+LEVEL_STREAM = 1  # keeps the generator that chooses levels apart from the one that builds them
+
+
+class MemoryGymVectorEnv(VectorEnv):
+    """N environments of one id, stepped together.
+
+    Arguments:
+        variant: the id, a key of the family's `variants`.
+        num_envs: N, at least 1.
+        render_mode: None, "rgb_array" (what the agent sees) or "debug_rgb_array" (larger, with the ground truth).
+        num_levels: with n > 0, every reset without a seed, automatic ones too, plays a level drawn from n; None or 0:
+            no limit. A level is what `reset(seed=level)` builds.
+        start_level: the first of those n levels.
+
+    Raises ValueError for any other argument value.
+
+    Observations, rewards (N,) float64, terminations and truncations (N,) bool and infos are fresh arrays at every call.
+    An episode that ends is reset in the same step: `final_obs` and `final_info` hold its last observation and info, in
+    the layout of Gymnasium's `SyncVectorEnv`. Every info has `ground_truth` (N, G) float64.
+
+    Each lane has a generator of its own, Gymnasium's `np_random(seed)`; nothing is drawn from anywhere else.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 25,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+    variants: ClassVar[Mapping[str, Any]] = {}
+
+    def __init__(
+        self,
+        variant: str,
+        num_envs: int = 1,
+        render_mode: str | None = None,
+        num_levels: int | None = None,
+        start_level: int = 0,
+    ):
+        if variant not in self.variants:
+            raise ValueError(f"variant must be one of {', '.join(self.variants)}, not {variant!r}")
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ValueError(f"render_mode must be None, {' or '.join(map(repr, RENDER_MODES))}, not {render_mode!r}")
+        self.num_envs = _integer("num_envs", num_envs, 1)
+        self.num_levels = _integer("num_levels", num_levels or 0, 0)
+        self.start_level = _integer("start_level", start_level, 0)
+        self.variant_id, self.variant, self.render_mode = variant, self.variants[variant], render_mode
+        self.metadata = {**type(self).metadata, "render_fps": self.variant.render_fps}
+        self.single_observation_space, self.single_action_space = self.spaces()
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._action_shape = (self.num_envs, *self.single_action_space.shape)
+        self._action_count = _choices(self.single_action_space)
+        self._rngs: list[np.random.Generator | None] = [None] * self.num_envs
+        self._level_rngs: list[np.random.Generator | None] = [None] * self.num_envs
+        self._seeds: list[int | None] = [None] * self.num_envs
+        self.defaults = resolve(self.variant.options, None, variant)
+        self.settings = [self.defaults] * self.num_envs  # each lane's reset options, never changed in place
+        self.ready = False
+        self.allocate()
+
+    # ---- what a family provides ----
+
+    def spaces(self) -> tuple[gym.Space, gym.Space]:
+        """The observation and the action space of one lane."""
+        raise NotImplementedError
+
+    def allocate(self) -> None:
+        """Makes the state arrays of N lanes."""
+        raise NotImplementedError
+
+    def configure(self, lanes: np.ndarray) -> None:
+        """Takes over `self.settings` of the lanes, whose options were just set by an explicit reset."""
+        raise NotImplementedError
+
+    def begin(self, lane: int, rng: np.random.Generator) -> None:
+        """Builds the lane's next level from the generator and starts its episode."""
+        raise NotImplementedError
+
+    def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Applies the rules for one step: rewards, terminations, truncations, each (N,). Resets nothing."""
+        raise NotImplementedError
+
+    def observe(self, lanes: np.ndarray | slice) -> Any:
+        """Fresh observations of the lanes, drawn from the state alone."""
+        raise NotImplementedError
+
+    def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh frames of the lanes, (n, 84, 84, 3) uint8: what the agent sees."""
+        raise NotImplementedError
+
+    def ground_truth(self) -> np.ndarray:
+        """A fresh (N, G) float64 array of what the agent has to remember or infer."""
+        raise NotImplementedError
+
+    def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
+        """The lanes' ended episodes in numbers, each (n,): the final info but for the ground truth."""
+        raise NotImplementedError
+
+    def annotate(self, frame: np.ndarray, lane: int) -> None:
+        """Draws the lane's ground truth over its magnified frame, in place."""
+        raise NotImplementedError
+
+    # ---- Gymnasium's interface ----
+
+    def reset(self, *, seed: Any = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Starts new episodes, and returns observations and infos.
+
+        seed: an integer (lane i gets seed + i), a list of N integers or Nones, or None: the lanes' generators go on.
+        options: reset parameters, kept until the next explicit reset (None: the defaults). `reset_mask`, a bool array
+            (N,), limits the reset to some lanes: the other lanes' observations are returned as they were.
+
+        Raises ValueError for a wrong seed or option; nothing has changed then.
+        """
+        lanes, options = self._split_mask(options)
+        seeds = self._lane_seeds(seed)
+        self.restart(lanes, seeds, self.resolve(options))
+        return self.observe(ALL), self._truth_info(lanes)
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One step of every lane; lanes whose episode ends are reset at once.
+
+        actions: (N,) or (N, 2) integers. Raises ValueError for any other shape, type or range, and Gymnasium's
+        ResetNeeded before the first reset.
+        """
+        if not self.ready:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        rewards, terminated, truncated = self.advance(self.checked_actions(actions))
+        infos: dict[str, Any] = {}
+        ended = np.flatnonzero(terminated | truncated)
+        if ended.size:
+            infos = self._final_info(ended)
+            for lane in ended.tolist():
+                self._next_level(lane, None)
+        infos.update(self._truth_info(None))
+        return self.observe(ALL), rewards, terminated, truncated, infos
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """One picture per lane: (84, 84, 3), or (336, 336, 3) in the debug mode. None without a render mode."""
+        if self.render_mode is None:
+            gym.logger.warn("render() needs an environment that was made with render_mode, e.g. 'rgb_array'")
+            return None
+        if not self.ready:
+            raise gym.error.ResetNeeded("call reset() before render()")
+        frames = self.frames(ALL)
+        if self.render_mode == "rgb_array":
+            return tuple(frames)
+        large = [magnify(frame, DEBUG_ZOOM) for frame in frames]
+        for lane, frame in enumerate(large):
+            self.annotate(frame, lane)
+        return tuple(large)
+
+    @property
+    def np_random(self) -> tuple[np.random.Generator | None, ...]:
+        """Each lane's generator; None before the first reset."""
+        return tuple(self._rngs)
+
+    @property
+    def np_random_seed(self) -> tuple[int | None, ...]:
+        """What each lane's generator was seeded with; -1 if it was set from outside."""
+        return tuple(self._seeds)
+
+    def set_generator(self, lane: int, rng: np.random.Generator) -> None:
+        """Makes the lane draw from this generator from now on."""
+        self._rngs[lane], self._seeds[lane] = rng, -1
+
+    # ---- parts ----
+
+    def resolve(self, options: Mapping[str, Any] | None) -> dict[str, Any]:
+        """The complete reset options. Raises ValueError for a wrong one."""
+        if options is None:
+            return self.defaults
+        return resolve(self.variant.options, options, self.variant_id)
+
+    def restart(self, lanes: np.ndarray, seeds: list[int | None], settings: dict[str, Any]) -> None:
+        """An explicit reset of the lanes with these checked seeds (one for every lane of N) and options."""
+        if not self.ready or any(self.settings[lane] != settings for lane in lanes.tolist()):
+            for lane in lanes.tolist():
+                self.settings[lane] = settings
+            self.configure(lanes)
+        for lane in lanes.tolist():
+            self._next_level(lane, seeds[lane])
+        self.ready = True
+
+    def _next_level(self, lane: int, seed: int | None) -> None:
+        """Seeds the lane's generator if there is a seed or a choice of levels, and starts its next episode."""
+        if seed is not None and self.num_levels:
+            stream = np.random.SeedSequence(seed, spawn_key=(LEVEL_STREAM,))
+            self._level_rngs[lane] = np.random.Generator(np.random.PCG64(stream))
+        elif seed is None and self.num_levels:
+            if self._level_rngs[lane] is None:
+                self._level_rngs[lane] = np.random.default_rng()
+            seed = self.start_level + int(self._level_rngs[lane].integers(self.num_levels))
+        if seed is not None or self._rngs[lane] is None:
+            self._rngs[lane], self._seeds[lane] = seeding.np_random(seed)
+        self.begin(lane, self._rngs[lane])
+
+    def checked_actions(self, actions: Any) -> np.ndarray:
+        """The actions as int64, or a ValueError that says what they must be."""
+        try:
+            array = np.asarray(actions)
+        except ValueError:  # rows of different lengths
+            array = np.asarray(None)
+        if array.shape == self._action_shape and array.dtype.kind in "iu":
+            array = array.astype(np.int64, copy=False)
+            # Negative numbers are huge as unsigned ones, so one comparison checks both ends.
+            if not np.count_nonzero(array.view(np.uint64) >= self._action_count):
+                return array
+        limit = f"integers from 0 to {self._action_count - 1} of shape {self._action_shape}"
+        raise ValueError(f"{self.variant_id}: actions must be {limit}, not {_brief(actions)}")
+
+    def _split_mask(self, options: Mapping[str, Any] | None) -> tuple[np.ndarray, Mapping[str, Any] | None]:
+        if not isinstance(options, Mapping) or "reset_mask" not in options:
+            return np.arange(self.num_envs), options
+        mask = np.asarray(options["reset_mask"])
+        if mask.dtype != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
+            raise ValueError(f"reset_mask must be a bool array of shape ({self.num_envs},) with at least one True")
+        if not self.ready and not mask.all():
+            raise ValueError("reset_mask must hold every lane at the first reset")
+        return np.flatnonzero(mask), {name: value for name, value in options.items() if name != "reset_mask"}
+
+    def _lane_seeds(self, seed: Any) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, (list, tuple, np.ndarray)):
+            if len(seed) != self.num_envs:
+                raise ValueError(f"seed must hold one entry for each of {self.num_envs} lanes, not {len(seed)}")
+            return [None if each is None else _integer("seed", each, 0) for each in seed]
+        first = _integer("seed", seed, 0)
+        return [first + lane for lane in range(self.num_envs)]
+
+    def _truth_info(self, lanes: np.ndarray | None) -> dict[str, np.ndarray]:
+        """The info that every step and reset has; lanes: those that it is for, None for all."""
+        truth, mask = self.ground_truth(), np.ones(self.num_envs, bool)
+        if lanes is not None and len(lanes) < self.num_envs:
+            mask[:] = False
+            mask[lanes] = True
+            truth[~mask] = 0.0
+        return {"ground_truth": truth, "_ground_truth": mask}
+
+    def _final_info(self, ended: np.ndarray) -> dict[str, Any]:
+        """final_obs and final_info of the lanes whose episode ended, as SyncVectorEnv lays them out."""
+        mask = np.zeros(self.num_envs, bool)
+        mask[ended] = True
+        final_obs = np.full(self.num_envs, None, object)
+        for lane, observation in zip(ended.tolist(), _unbatched(self.observe(ended)), strict=True):
+            final_obs[lane] = observation
+        truth = self.ground_truth()
+        truth[~mask] = 0.0
+        final_info: dict[str, np.ndarray] = {}
+        for key, values in self.summary(ended).items():
+            column = np.zeros(self.num_envs, values.dtype)
+            column[ended] = values
+            final_info[key], final_info[f"_{key}"] = column, mask.copy()
+        final_info.update(ground_truth=truth, _ground_truth=mask.copy())
+        return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask.copy()}
+
+
+def _choices(space: gym.Space) -> int:
+    """How many values an action has: the families' branches are all equally wide."""
+    return int(space.nvec[0]) if isinstance(space, gym.spaces.MultiDiscrete) else int(space.n)
+
+
+def _integer(name: str, value: Any, low: int) -> int:
+    try:
+        number = -1 if isinstance(value, (bool, np.bool_)) else operator.index(value)
+    except TypeError:
+        number = -1
+    if number < low:
+        raise ValueError(f"{name} must be an integer of at least {low}, not {value!r}")
+    return number
+
+
+def _brief(value: Any) -> str:
+    text = repr(value).replace("\n", "")
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _unbatched(observations: Any) -> list[Any]:
+    """The lanes' observations one by one."""
+    if isinstance(observations, dict):
+        columns = zip(*observations.values(), strict=True)
+        return [dict(zip(observations, column, strict=True)) for column in columns]
+    return list(observations)

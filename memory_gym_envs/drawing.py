@@ -1,0 +1,117 @@
+"""Drawing by geometry in NumPy: shapes as boolean masks, and sprites pasted into many frames at once.
+
+Frames are (n, 84, 84, 3) uint8, rows first: frames[i, y, x]. Masks are (height, width) bool.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+SCREEN = 84  # width and height of an observation in pixels
+ROW = 3 * SCREEN  # bytes in a row of a frame
+FRAME = SCREEN * ROW  # bytes in a frame
+
+
+def disk(size: int, x: float, y: float, radius: int) -> np.ndarray:
+    """A filled circle on a (size, size) mask, as a midpoint rasteriser draws it.
+
+    (x, y) is the corner where the four central pixels meet, so the disk is 2 * radius pixels wide.
+    """
+    columns, rows = np.arange(size) + 0.5 - x, np.arange(size) + 0.5 - y
+    across, down = np.abs(columns)[None, :] + 0.5, np.abs(rows)[:, None] + 0.5  # >= 1
+    short, long = np.minimum(across, down), np.maximum(across, down)
+    # A rasteriser walks one octant and rounds the other axis, hence the half pixel on the longer leg alone.
+    return (short**2 + (long - 0.5) ** 2 < radius**2) | ((long <= radius) & (long <= 1))
+
+
+def ring(size: int, x: float, y: float, radius: int, width: int) -> np.ndarray:
+    """A circle of the given line width on a (size, size) mask."""
+    return disk(size, x, y, radius) & ~disk(size, x, y, radius - width)
+
+
+def turned_45(mask: np.ndarray, size: int) -> np.ndarray:
+    """A square mask turned by 45 degrees counter-clockwise about its centre, on a (size, size) mask."""
+    old = len(mask)
+    offset = np.arange(size) + 0.5 - size / 2
+    x, y = offset[None, :], offset[:, None]
+    half = np.sqrt(0.5)
+    source_x = np.floor((x - y) * half + old / 2).astype(int)  # (size, size)
+    source_y = np.floor((x + y) * half + old / 2).astype(int)
+    inside = (source_x >= 0) & (source_x < old) & (source_y >= 0) & (source_y < old)
+    return inside & mask[source_y.clip(0, old - 1), source_x.clip(0, old - 1)]
+
+
+class Sheet(NamedTuple):
+    """Sprites ready to be pasted at any place of a frame, cut off at the screen's edges.
+
+    Each sprite lies in the middle of a transparent canvas. To paste one is to choose a W x W window of the frame that
+    stays on the screen, the window of the canvas that covers the same place, and to blend the two: frame & keep | ink.
+    """
+
+    row: np.dtype  # of one row of a window: W pixels as one opaque item, which NumPy copies twice as fast as bytes
+    canvas: int  # width and height of a sprite's canvas
+    keep: np.ndarray  # (starts, W) rows: the windows at every start; 255 where a sprite is transparent
+    ink: np.ndarray  # (starts, W) likewise: colours, 0 where a sprite is transparent
+    frame_start: np.ndarray  # (P * P,) first pixel of the frame's window, for every y and x
+    canvas_start: np.ndarray  # (P * P,) first pixel of the canvas' window, for every y and x
+    positions: int  # P
+
+
+def make_sheet(sprites: np.ndarray, solid: np.ndarray, positions: np.ndarray) -> Sheet:
+    """Prepares (R, W, W, 3) sprites, solid where the (R, W, W) mask says, for centres at the given positions.
+
+    positions: (P,) the place on the screen, in pixels along one axis, that each index of `pos` in `paste` stands for.
+    A sprite's centre is the corner between its four central pixels.
+    """
+    count, width = solid.shape[:2]
+    frame_start = (positions - width // 2).clip(0, SCREEN - width)
+    shift = frame_start - (positions - width // 2)  # > 0: cut off at the left or top, < 0: at the right or bottom
+    before, after = max(0, -int(shift.min())), max(0, int(shift.max()))
+    canvas = before + width + after
+    keep = np.full((count, canvas, canvas, 3), 255, np.uint8)
+    ink = np.zeros((count, canvas, canvas, 3), np.uint8)
+    middle = slice(before, before + width)
+    keep[:, middle, middle] = np.where(solid[..., None], 0, 255)
+    ink[:, middle, middle] = np.where(solid[..., None], sprites, 0)
+    source = shift + before
+    row = np.dtype(f"V{3 * width}")
+    return Sheet(
+        row,
+        canvas,
+        windows(keep, canvas, row),
+        windows(ink, canvas, row),
+        (frame_start[:, None] * SCREEN + frame_start).reshape(-1),
+        (source[:, None] * canvas + source).reshape(-1),
+        len(positions),
+    )
+
+
+def paste(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray) -> None:
+    """Pastes sprite rows[i] of the sheet into frames[i], centred at pos[i].
+
+    frames: (n, FRAME) uint8, contiguous, changed in place. rows: (n,). pos: (n, 2), x and y, indices of positions.
+    """
+    place = pos[:, 1] * sheet.positions + pos[:, 0]  # (n,)
+    start = sheet.frame_start.take(place) + np.arange(0, len(frames) * SCREEN * SCREEN, SCREEN * SCREEN)
+    source = sheet.canvas_start.take(place) + rows * (sheet.canvas * sheet.canvas)
+    squares = windows(frames, SCREEN, sheet.row)  # a square never leaves its frame, as frame_start is clipped
+    patch = squares[start]  # (n, W) rows
+    pixels = patch.view(np.uint8)  # (n, W * W * 3), the same memory
+    pixels &= sheet.keep[source].view(np.uint8)
+    pixels |= sheet.ink[source].view(np.uint8)
+    squares[start] = patch
+
+
+def windows(images: np.ndarray, across: int, row: np.dtype) -> np.ndarray:
+    """Every W x W square of a contiguous stack of images, by its first pixel: (starts, W) rows, a view.
+
+    images: uint8 of any shape, in memory a stack of (across, across, 3).
+    """
+    width = row.itemsize // 3
+    starts = images.size // 3 - (width - 1) * (across + 1)
+    return np.ndarray((starts, width), row, images, 0, (3, 3 * across))
+
+
+def magnify(frame: np.ndarray, factor: int) -> np.ndarray:
+    """A frame enlarged by a whole factor, nearest neighbour."""
+    return frame.repeat(factor, axis=0).repeat(factor, axis=1)

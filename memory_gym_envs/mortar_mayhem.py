@@ -1,0 +1,581 @@
+"""Mortar Mayhem: memorise a sequence of commands, then carry them out in time (thesis 4.3).
+
+Shape letters: N lanes, n some of them, C commands that fit, L steps that the longest clue needs.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from memory_gym_envs.base import ALL, DEBUG_ZOOM, MemoryGymVectorEnv
+from memory_gym_envs.character import (
+    FACINGS,
+    PAD,
+    SPAN,
+    STRIDES,
+    Figure,
+    free_controls,
+    grid_controls,
+    radius_of,
+    walk,
+    wardrobe,
+)
+from memory_gym_envs.drawing import ROW, SCREEN, Sheet, paste, ring, turned_45
+from memory_gym_envs.options import Option
+
+TILE = 14  # pixels
+SIZES = range(2, 7)  # tiles along one side of the arena
+TORUS_SIZE = 6  # fills the screen
+
+# In the original's order: allowed_commands=k allows the first k.
+COMMANDS = ("right", "down", "left", "up", "stay", "right_down", "right_up", "left_down", "left_up")
+MOVES = np.array([(1, 0), (0, 1), (-1, 0), (0, -1), (0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)])  # (9, 2) tiles
+MOVES_LIST = MOVES.tolist()  # for one lane at a time
+VECTOR_ORDER = ("stay", "right", "left", "up", "down", "right_down", "right_up", "left_down", "left_up")
+VECTOR_AT = [VECTOR_ORDER.index(command) for command in COMMANDS]
+VECTOR_COMMANDS = 20  # commands that the command vector has room for
+BLANK = 0  # what a clue shows between commands; 1 + command otherwise
+
+EVERY_LANE = np.True_  # a mask, when no lane has to be left out
+NO_LIMIT = np.iinfo(np.int64).max
+
+
+# ---- configuration ----
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What tells one Mortar Mayhem id from another."""
+
+    grid: bool  # turn and walk tile by tile, instead of free movement
+    clue: bool  # commands are shown one by one before the act task, instead of given as a vector
+    endless: bool  # one more command after each completed sequence, on a torus
+    jitter: bool  # the agent starts up to two pixels off its tile's centre
+    render_fps: int
+    options: tuple[Option, ...]
+
+
+def _options(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
+    """The reset options of an id, in the original's order of names."""
+    fuse, burn = ((6,), (2,)) if grid else ((18,), (6,))
+    size, note = "size of the agent; 0.25: 12 pixels wide", "; ignored, as in the original" if grid else ""
+    rows = [
+        (endless, Option("max_steps", -1, "int", 1, None, "steps until truncation; -1: no limit", also=(-1,))),
+        (True, Option("agent_scale", 0.25, "float", 0.04, 1.0, size + note)),
+        (not grid, Option("agent_speed", 3.0, "float", 0.0, 84.0, "pixels that the agent walks in a step")),
+        (not endless, Option("arena_size", 5, "int", SIZES[0], SIZES[-1], "tiles along one side of the arena")),
+        (True, Option("allowed_commands", 5 if grid else 9, "int", 4, 9, "how many kinds of command may occur")),
+        (not endless, Option("command_count", (10,), "ints", 1, 100 if clue else VECTOR_COMMANDS, "commands to do *")),
+        (endless, Option("initial_command_count", 1, "int", 1, 100, "commands in the first sequence")),
+        (clue, Option("command_show_duration", (3,), "ints", 1, 100, "steps that a command is shown *")),
+        (clue, Option("command_show_delay", (1,), "ints", 0, 100, "blank steps after a shown command *")),
+        (True, Option("explosion_duration", burn, "ints", 1, 1000, "steps that the tiles burn *")),
+        (True, Option("explosion_delay", fuse, "ints", 1, 1000, "steps to carry out a command in *")),
+        (True, Option("visual_feedback", True, "bool", None, None, "show burning tiles in red")),
+        (True, Option("reward_command_failure", 0.0, "float", None, None, "reward for standing on a burning tile")),
+        (True, Option("reward_command_success", 0.1, "float", None, None, "reward for each command carried out")),
+        (not endless, Option("reward_episode_success", 0.0, "float", None, None, "added with the last command's")),
+    ]
+    return tuple(option for present, option in rows if present)
+
+
+def _variant(fps: int, grid: bool = False, clue: bool = True, endless: bool = False) -> Variant:
+    jitter = endless or not (clue or grid)
+    return Variant(grid, clue, endless, jitter, fps, _options(grid, clue, endless))
+
+
+VARIANTS = {
+    "MortarMayhem-v0": _variant(25),
+    "MortarMayhem-Grid-v0": _variant(6, grid=True),
+    "MortarMayhemB-v0": _variant(25, clue=False),
+    "MortarMayhemB-Grid-v0": _variant(1, grid=True, clue=False),
+    "Endless-MortarMayhem-v0": _variant(25, endless=True),
+}
+
+
+# ---- state ----
+
+
+@dataclass
+class State:
+    """One array a field, one row a lane. Positions are stored with PAD added, targets are tiles."""
+
+    pos: np.ndarray  # (N, 2) the agent's centre, x and y
+    facing: np.ndarray  # (N,)
+    figure: np.ndarray  # (N,) which of the batch's figures the agent is
+    size: np.ndarray  # (N,) tiles along one side
+    floor: np.ndarray  # (N,) picture of the arena, a row of floors()
+    target: np.ndarray  # (N, 2) the tile to reach
+    goal: np.ndarray  # (N, 2) the first pixel of that tile, with PAD
+    truth: np.ndarray  # (N, 2) float64: that tile, divided by arena size - 1
+    commands: np.ndarray  # (N, C)
+    count: np.ndarray  # (N,) length of the sequence
+    current: np.ndarray  # (N,) commands checked so far, in this round of the sequence
+    completed: np.ndarray  # (N,) commands carried out so far, in the episode
+    clue: np.ndarray  # (N, L) uint8: what is shown at each step of the clue; BLANK at its end and after
+    clue_at: np.ndarray  # (N,) the step that is being shown
+    clue_end: np.ndarray  # (N,) the first step without a clue, where the agent may act
+    symbol: np.ndarray  # (N,) what the frame shows: BLANK or 1 + command
+    timer: np.ndarray  # (N,) acting steps until the tiles are lit or put out
+    lit: np.ndarray  # (N,) bool: all tiles but the target burn
+    fuse: np.ndarray  # (N,) this episode's explosion_delay
+    burn: np.ndarray  # (N,) this episode's explosion_duration
+    show: np.ndarray  # (N,) this episode's command_show_duration
+    gap: np.ndarray  # (N,) this episode's command_show_delay
+    length: np.ndarray  # (N,) steps so far
+    returned: np.ndarray  # (N,) float64: sum of rewards so far
+    vector: np.ndarray  # (N, 180) float32: the commands as one-hot rows
+    # Options that the rules need at every step.
+    feedback: np.ndarray  # (N,) bool
+    limit: np.ndarray  # (N,) steps until truncation
+    reward_success: np.ndarray  # (N,) float64
+    reward_failure: np.ndarray  # (N,) float64
+    reward_episode: np.ndarray  # (N,) float64
+
+
+def empty_state(lanes: int) -> State:
+    """The state of N lanes before their first reset."""
+    shapes = {"pos": (2,), "target": (2,), "goal": (2,), "truth": (2,), "commands": (1,), "clue": (1,)}
+    shapes["vector"] = (VECTOR_COMMANDS * len(COMMANDS),)
+    kinds = {"lit": bool, "feedback": bool, "clue": np.uint8, "vector": np.float32}
+    kinds |= dict.fromkeys(("truth", "returned", "reward_success", "reward_failure", "reward_episode"), np.float64)
+    names = State.__dataclass_fields__
+    return State(**{name: np.zeros((lanes, *shapes.get(name, ())), kinds.get(name, np.int64)) for name in names})
+
+
+def widened(array: np.ndarray, width: int) -> np.ndarray:
+    """The same rows with room for at least `width` columns."""
+    missing = width - array.shape[1]
+    return array if missing <= 0 else np.pad(array, ((0, 0), (0, missing)))
+
+
+# ---- levels ----
+
+
+class Level(NamedTuple):
+    """What the generator decides at a reset."""
+
+    tile: tuple[int, int]
+    offset: tuple[int, int]
+    commands: list[int]
+    show: int
+    gap: int
+    burn: int
+    fuse: int
+
+
+def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
+    """Draws a level in the original's order, so that its seeds mean the same here."""
+    size = TORUS_SIZE if variant.endless else values["arena_size"]
+    tile = divmod(int(rng.integers(0, size * size)), size)
+    offset = (int(rng.integers(-2, 2)), int(rng.integers(-2, 2))) if variant.jitter else (0, 0)
+    if variant.endless:
+        kinds = values["allowed_commands"]
+        commands = [int(rng.integers(ZERO, BELOW[kinds])) for _ in range(values["initial_command_count"])]
+    else:
+        commands = draw_walk(rng, tile, _pick(rng, values["command_count"]), size, values["allowed_commands"])
+    show = _pick(rng, values["command_show_duration"]) if variant.clue else 0
+    gap = _pick(rng, values["command_show_delay"]) if variant.clue else 0
+    burn = _pick(rng, values["explosion_duration"])
+    return Level(tile, offset, commands, show, gap, burn, _pick(rng, values["explosion_delay"]))
+
+
+def draw_walk(rng: np.random.Generator, tile: tuple[int, int], count: int, size: int, kinds: int) -> list[int]:
+    """Commands that lead from the tile through the arena without leaving it."""
+    steps = _valid_commands(size, kinds)
+    commands = []
+    for _ in range(count):
+        valid = steps[tile]
+        command, tile = valid[rng.integers(ZERO, BELOW[len(valid)])]
+        commands.append(command)
+    return commands
+
+
+# Arrays without dimensions: the generator takes them faster than numbers, and draws the same.
+ZERO, BELOW = np.array(0), [np.array(limit) for limit in range(len(COMMANDS) + 1)]
+
+
+@cache
+def _valid_commands(size: int, kinds: int) -> dict[tuple[int, int], list[tuple[int, tuple[int, int]]]]:
+    """For every tile the commands that stay inside the arena, each with the tile it leads to."""
+    moves = list(enumerate(MOVES[:kinds].tolist()))
+    tiles = [(x, y) for x in range(size) for y in range(size)]
+    inside = set(tiles)
+    return {
+        (x, y): [(command, (x + dx, y + dy)) for command, (dx, dy) in moves if (x + dx, y + dy) in inside]
+        for x, y in tiles
+    }
+
+
+def _pick(rng: np.random.Generator, values: tuple[int, ...]) -> int:
+    """What Generator.choice would pick. It draws nothing from a single value."""
+    return values[0] if len(values) == 1 else values[int(rng.integers(0, len(values)))]
+
+
+def write_level(s: State, lane: int, level: Level, variant: Variant) -> None:
+    """Starts the lane's episode at this level."""
+    size, count = int(s.size[lane]), len(level.commands)
+    origin = SCREEN // 2 - TILE * size // 2 + PAD
+    (x, y), (dx, dy) = level.tile, MOVES_LIST[level.commands[0]]
+    target = ((x + dx) % size, (y + dy) % size)  # only on a torus does a command lead across the border
+    for axis, start in enumerate(level.tile):
+        s.pos[lane, axis] = origin + TILE * start + TILE // 2 + level.offset[axis]
+        s.target[lane, axis] = target[axis]
+        s.goal[lane, axis] = origin + TILE * target[axis]
+        s.truth[lane, axis] = target[axis] / (size - 1)
+    s.facing[lane] = s.current[lane] = s.completed[lane] = s.length[lane] = s.returned[lane] = 0
+    s.lit[lane] = False
+    s.floor[lane] = floor_row(size)
+    s.count[lane] = count
+    s.commands[lane, :count] = level.commands
+    s.fuse[lane], s.burn[lane], s.show[lane], s.gap[lane] = level.fuse, level.burn, level.show, level.gap
+    s.timer[lane] = level.fuse + 1  # the first command has a step more than the others
+    if variant.clue:
+        write_clue(s, lane, level.commands)
+        s.clue_at[lane] = 0
+        s.symbol[lane] = s.clue[lane, 0]
+    else:
+        row = s.vector[lane]  # (180,)
+        row.fill(0.0)
+        for step, command in enumerate(level.commands):
+            row[len(COMMANDS) * step + VECTOR_AT[command]] = 1.0
+
+
+def write_clue(s: State, lane: int, commands: list[int]) -> None:
+    """Plans what the lane sees at each step of a clue: every command for a while, then nothing for a while."""
+    period = int(s.show[lane] + s.gap[lane])
+    end = period * len(commands)
+    plan = s.clue[lane]  # (L,)
+    plan[: end + 1] = BLANK
+    plan[:end].reshape(len(commands), period)[:, : s.show[lane]] = np.array(commands)[:, None] + 1
+    s.clue_end[lane] = end
+
+
+# ---- drawing ----
+
+BLUE, LIGHT_BLUE = (21, 43, 77), (29, 60, 107)
+RED, LIGHT_RED = (81, 18, 26), (112, 24, 36)
+GREEN = (0, 255, 0)
+SYMBOL, SYMBOL_AT = 24, 31  # width of the symbols' square, and its first pixel on both axes
+
+
+def floor_row(size: int) -> int:
+    """The row of floors() that shows an arena of this size in blue; the lit ones follow, by target tile."""
+    return sum(1 + smaller * smaller for smaller in range(SIZES[0], size))
+
+
+@cache
+def floors() -> np.ndarray:
+    """(F, FRAME) uint8, read-only: every arena, blue or burning around each possible target."""
+    blue, red = (np.tile(np.array(color, np.uint8), (TILE, TILE, 1)) for color in (LIGHT_BLUE, LIGHT_RED))
+    blue[1:-1, 1:-1], red[1:-1, 1:-1] = BLUE, RED
+    pictures = []
+    for size in SIZES:
+        targets = [None, *((x, y) for x in range(size) for y in range(size))]
+        for target in targets:
+            frame = np.zeros((SCREEN, SCREEN, 3), np.uint8)
+            origin = SCREEN // 2 - TILE * size // 2
+            for x in range(size):
+                for y in range(size):
+                    tile = blue if target is None or (x, y) == target else red
+                    top, left = origin + TILE * y, origin + TILE * x
+                    frame[top : top + TILE, left : left + TILE] = tile
+            pictures.append(frame.reshape(-1))
+    table = np.stack(pictures)
+    table.flags.writeable = False
+    return table
+
+
+@cache
+def symbols() -> np.ndarray:
+    """(10, SYMBOL, 3 * SYMBOL) uint8, read-only: nothing, then the commands. White on black, so `or` draws them."""
+    arrow, circle = arrow_mask(), ring(22, 10, 10, 10, 2)
+    circle[9:11, :20] = True
+    # A turned arrow's square is larger. It keeps the top left corner, so it sits lower and further to the right.
+    oblique = turned_45(arrow, 31)
+    masks = {"stay": circle}
+    for quarter, (straight, slanted) in enumerate(
+        [("right", "right_up"), ("up", "left_up"), ("left", "left_down"), ("down", "right_down")]
+    ):
+        masks[straight], masks[slanted] = np.rot90(arrow, quarter), np.rot90(oblique, quarter)
+    table = np.zeros((1 + len(COMMANDS), SYMBOL, SYMBOL, 3), np.uint8)
+    for command, name in enumerate(COMMANDS):
+        mask = masks[name][:SYMBOL, :SYMBOL]
+        table[1 + command, : len(mask), : len(mask)][mask] = 255
+    table = table.reshape(-1, SYMBOL, 3 * SYMBOL)
+    table.flags.writeable = False
+    return table
+
+
+def arrow_mask() -> np.ndarray:
+    """(22, 22) an arrow to the right, two pixels thick: a shaft and a head of two 45-degree strokes."""
+    rows, columns = np.indices((22, 22))
+    aside = np.abs(rows - 10)
+    head = (aside <= 10) & (columns + aside >= 20) & (columns + aside <= 21)
+    return head | ((rows >= 10) & (rows <= 11) & (columns <= 20))
+
+
+def draw(s: State, sheet: Sheet, lanes: np.ndarray | slice) -> np.ndarray:
+    """Fresh frames of the lanes, (n, 84, 84, 3) uint8, from the state alone."""
+    frames = floors().take(s.floor[lanes], axis=0)  # (n, FRAME)
+    paste(frames, sheet, s.figure[lanes] * FACINGS + s.facing[lanes], s.pos[lanes])
+    symbol = s.symbol[lanes]
+    if np.count_nonzero(symbol):
+        square = frames.reshape(-1, SCREEN, ROW)[:, SYMBOL_AT : SYMBOL_AT + SYMBOL, 3 * SYMBOL_AT :][..., : 3 * SYMBOL]
+        square |= symbols().take(symbol, axis=0)  # (n, SYMBOL, 3 * SYMBOL)
+    return frames.reshape(-1, SCREEN, SCREEN, 3)
+
+
+# ---- rules ----
+
+
+def show_clue(s: State, first_step: np.ndarray) -> np.ndarray:
+    """The next step of every clue: what is shown, and (N,) bool which lanes have none left and may act.
+
+    first_step: (N,) where each lane's plan starts in the flattened State.clue.
+    """
+    s.clue_at += 1
+    np.minimum(s.clue_at, s.clue_end, out=s.clue_at)
+    s.symbol = s.clue.take(first_step + s.clue_at)
+    return s.clue_at == s.clue_end
+
+
+def on_target(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+    """(n,) bool: whose centre is on its target tile."""
+    # Places before the tile are negative, which is huge as an unsigned number.
+    ahead = (s.pos[lanes] - s.goal[lanes]).view(np.uint64) < TILE  # (n, 2)
+    return ahead[:, 0] & ahead[:, 1]
+
+
+def light(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sets all tiles but the target on fire: who carried the command out, and whose sequence is through, both (n,)."""
+    s.current[lanes] += 1
+    s.lit[lanes] = True
+    s.timer[lanes] = s.burn[lanes]
+    seen = lanes[s.feedback[lanes]]
+    s.floor[seen] += 1 + s.target[seen, 0] * s.size[seen] + s.target[seen, 1]
+    hit = on_target(s, lanes)
+    s.completed[lanes] += hit
+    return hit, s.current[lanes] >= s.count[lanes]
+
+
+def put_out(s: State, lanes: np.ndarray) -> None:
+    """Puts the fire out and moves the target on by the next command."""
+    seen = lanes[s.feedback[lanes]]
+    s.floor[seen] -= 1 + s.target[seen, 0] * s.size[seen] + s.target[seen, 1]
+    s.lit[lanes] = False
+    s.timer[lanes] = s.fuse[lanes]
+    size = s.size[lanes][:, None]  # (n, 1)
+    target = (s.target[lanes] + MOVES[s.commands[lanes, s.current[lanes]]]) % size  # (n, 2)
+    s.target[lanes] = target
+    s.goal[lanes] = SCREEN // 2 - TILE * size // 2 + PAD + TILE * target
+    s.truth[lanes] = target / (size - 1)
+
+
+class MortarMayhem(MemoryGymVectorEnv):
+    """Mortar Mayhem (thesis 4.3; memory-gym 1.0.2), N lanes at once.
+
+    Commands are shown one by one while the agent cannot move (the clue). Then it has `explosion_delay` steps to carry
+    out each: move to the neighbouring tile it names, or stay. Then all tiles but the right one burn for
+    `explosion_duration` steps, and whoever stands on a burning one has failed.
+
+    Variants:
+        MortarMayhem-v0: 10 commands on a 5 x 5 arena. MortarMayhem-Grid-v0: the same, tile by tile, no diagonals.
+        MortarMayhemB-v0, MortarMayhemB-Grid-v0: the act task alone, the commands given as a vector, no clue.
+        Endless-MortarMayhem-v0: a 6 x 6 torus that fills the screen. One command is shown, then all so far are carried
+            out from where the agent is; a completed sequence grows by one command, which alone is shown.
+
+    Actions: MultiDiscrete([3, 3]): horizontal (0 none, 1 left, 2 right) and vertical (0 none, 1 up, 2 down). Grid ids
+        Discrete(4): 0 nothing, 1 turn left, 2 turn right, 3 one tile forward. Ignored while a clue is shown.
+    Observation: Box (84, 84, 3) uint8, rows first. The B ids: Dict of `visual_observation`, that Box, and
+        `vector_observation` (180,) float32: 20 commands by 9 one-hot entries in the order of VECTOR_ORDER, zeros after
+        the last command.
+    Rewards: `reward_command_success` (0.1) when a command is checked and carried out, `reward_command_failure` (0) on a
+        burning tile, `reward_episode_success` (0) when the last command was.
+    Episode end: terminated by failure, or by the last command's check (not in the endless id). Truncated after
+        `max_steps` steps (the endless id; a failure at that very step counts as termination). With default options an
+        episode takes 58 to 274 steps (table 4.4), Grid 46 to 118, B 19 to 235, B-Grid 7 to 79. The B bounds are one
+        above the thesis' formula (18 to 234, 6 to 78), because the first command has explosion_delay + 1 steps;
+        behind a clue that step is made up for: the reset already shows the clue's first step.
+    Options: `VARIANTS[id].options`. Those marked * are lists, one entry of which is drawn at every reset.
+    Ground truth: (2,) the target tile's column and row, divided by arena size - 1.
+    Final info: `reward`, `length`, `commands_completed` and `success` (in the endless id `max_command_sequence`, the
+        length of the longest completed sequence). commands_completed is a share of the sequence, in the endless id a
+        number of commands.
+
+    Kept from the original: the command that ends the episode counts as uncompleted, even if it had been checked and
+        the agent then walked into the fire; failing at the very last command counts as success and completes all
+        commands, though only the failure's reward is paid; the sequence grows even if its last command failed, so
+        max_command_sequence then counts it as completed; walking into the fire overwrites what the step had earned.
+        In the endless id the tiles stay lit while a clue is shown, positions are rounded to the nearest pixel
+        (elsewhere steps are cut off, a diagonal one to 2 pixels at the default speed), and an agent whose centre is
+        beyond the screen's edge is on no tile. Grid ids ignore agent_scale.
+    Differences from the original: images are rows first; max_steps truncates; every id reports ground truth; an
+        episode's first frames show this episode's agent, not the last one's; wrong options raise ValueError.
+    """
+
+    variants = VARIANTS
+
+    def spaces(self) -> tuple[gym.Space, gym.Space]:
+        """The observation and the action space of one lane."""
+        image = gym.spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8)
+        vector = gym.spaces.Box(0.0, 1.0, (VECTOR_COMMANDS * len(COMMANDS),), np.float32)
+        both = gym.spaces.Dict({"visual_observation": image, "vector_observation": vector})
+        actions = gym.spaces.Discrete(4) if self.variant.grid else gym.spaces.MultiDiscrete([3, 3])
+        return image if self.variant.clue else both, actions
+
+    def allocate(self) -> None:
+        """Makes the state of N lanes."""
+        self.state = empty_state(self.num_envs)
+        self.figures = (self._figure(self.defaults),)  # all that differ, of all lanes
+        self._clues_open = False  # whether any lane may still have a clue to see
+        self._place_tables()
+
+    def configure(self, lanes: np.ndarray) -> None:
+        """Takes over the options of the lanes, and the tables that all lanes' options need."""
+        s, variant, values = self.state, self.variant, self.settings[int(lanes[0])]
+        s.size[lanes] = values.get("arena_size", TORUS_SIZE)
+        s.feedback[lanes] = values["visual_feedback"]
+        s.reward_success[lanes] = values["reward_command_success"]
+        s.reward_failure[lanes] = values["reward_command_failure"]
+        s.reward_episode[lanes] = values.get("reward_episode_success", 0.0)
+        limit = values.get("max_steps", -1)
+        s.limit[lanes] = NO_LIMIT if limit == -1 else limit
+        count = values["initial_command_count"] if variant.endless else max(values["command_count"])
+        s.commands = widened(s.commands, count + 1)
+        if variant.clue:
+            period = max(values["command_show_duration"]) + max(values["command_show_delay"])
+            s.clue = widened(s.clue, count * period + 1)
+        every = [self._figure(each) for each in self.settings]
+        self.figures = tuple(dict.fromkeys(every))
+        s.figure[:] = [self.figures.index(figure) for figure in every]
+        self._place_tables()
+
+    def _figure(self, values: dict[str, Any]) -> Figure:
+        half = TILE * values.get("arena_size", TORUS_SIZE) // 2
+        low, high = SCREEN // 2 - half, SCREEN // 2 + half
+        if self.variant.grid:
+            return Figure(0.25, TILE, low, high, TILE // 2, False)
+        scale = values["agent_scale"]
+        return Figure(scale, values["agent_speed"], low, high, radius_of(scale), self.variant.endless)
+
+    def _place_tables(self) -> None:
+        """The flat tables that step() looks things up in, and where each lane's rows start in them."""
+        self._wardrobe = wardrobe(self.figures)
+        self._controls = grid_controls() if self.variant.grid else free_controls()
+        self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
+        self._lane_clue = np.arange(self.num_envs) * self.state.clue.shape[1]  # (N,)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The tables are large and follow from the options.
+        return {name: value for name, value in self.__dict__.items() if name != "_wardrobe"}
+
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        self.__dict__.update(values)
+        self._place_tables()
+
+    def begin(self, lane: int, rng: np.random.Generator) -> None:
+        """Draws the lane's next level and starts its episode."""
+        write_level(self.state, lane, draw_level(rng, self.settings[lane], self.variant), self.variant)
+        self._clues_open = self.variant.clue
+
+    def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """One step of the rules: clue, walk, check, burn."""
+        s, variant = self.state, self.variant
+        rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, bool)
+        s.length += 1
+        acting = self._acting_lanes()
+        if np.count_nonzero(acting):
+            self._move(actions, acting)
+            s.timer -= acting
+            due = s.timer == 0  # only a lane that acts gets there
+            if np.count_nonzero(due):
+                self._change_tiles(np.flatnonzero(due), rewards, terminated)
+            burning = s.lit & acting
+            if np.count_nonzero(burning):
+                fallen = burning & ~on_target(s, ALL)
+                # Not added: the original overwrites whatever this step had earned.
+                np.copyto(rewards, s.reward_failure, where=fallen)
+                terminated |= fallen
+            s.returned += rewards
+        truncated = (s.length == s.limit) & ~terminated if variant.endless else np.zeros(self.num_envs, bool)
+        return rewards, terminated, truncated
+
+    def _acting_lanes(self) -> np.ndarray:
+        """Shows the clues' next step; (N,) bool which lanes may act, or just True when all have been acting."""
+        if not self._clues_open:
+            return EVERY_LANE
+        acting = show_clue(self.state, self._lane_clue)
+        self._clues_open = np.count_nonzero(acting) < self.num_envs
+        return acting
+
+    def _move(self, actions: np.ndarray, acting: np.ndarray) -> None:
+        s = self.state
+        action = actions if self.variant.grid else actions[:, 0] * 3 + actions[:, 1]  # (N,)
+        if acting is not EVERY_LANE:
+            action = np.where(acting, action, self._controls.actions - 1)
+        s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._wardrobe.walk)
+
+    def _change_tiles(self, lanes: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
+        """Lights the lanes' tiles and checks their command, or puts the tiles out."""
+        s = self.state
+        burnt_out = s.lit[lanes]
+        if np.count_nonzero(burnt_out):
+            put_out(s, lanes[burnt_out])
+            lanes = lanes[~burnt_out]
+        if lanes.size:
+            hit, through = light(s, lanes)
+            rewards[lanes] = s.reward_success[lanes] * hit
+            if self.variant.endless:
+                for lane in lanes[through].tolist():
+                    self._grow(lane)
+            else:
+                # Whether or not the last command was carried out, as in the original; a failure overwrites the reward.
+                rewards[lanes] += s.reward_episode[lanes] * through
+                terminated[lanes] = through
+
+    def _grow(self, lane: int) -> None:
+        """Appends a command to the lane's completed sequence and shows it from the next step on."""
+        s = self.state
+        command = int(self._rngs[lane].integers(0, self.settings[lane]["allowed_commands"]))
+        length = int(s.count[lane])
+        if length == s.commands.shape[1]:
+            s.commands = widened(s.commands, 2 * length)
+        s.commands[lane, length] = command
+        s.count[lane], s.current[lane] = length + 1, 0
+        write_clue(s, lane, [command])
+        s.clue_at[lane] = -1
+        self._clues_open = True
+
+    def observe(self, lanes: np.ndarray | slice) -> Any:
+        """Fresh observations of the lanes."""
+        if self.variant.clue:
+            return self.frames(lanes)
+        vector = self.state.vector[lanes]
+        return {"visual_observation": self.frames(lanes), "vector_observation": vector.copy()}
+
+    def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh frames of the lanes, (n, 84, 84, 3)."""
+        return draw(self.state, self._wardrobe.sheet, lanes)
+
+    def ground_truth(self) -> np.ndarray:
+        """A fresh (N, 2): the target's column and row, divided by arena size - 1."""
+        return self.state.truth.copy()
+
+    def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
+        """The lanes' ended episodes in numbers."""
+        s = self.state
+        numbers = {"reward": s.returned[lanes], "length": s.length[lanes]}
+        if self.variant.endless:
+            return numbers | {"commands_completed": s.completed[lanes], "max_command_sequence": s.count[lanes] - 1}
+        success = (s.current[lanes] >= s.count[lanes]).astype(np.int64)
+        share = (s.current[lanes] - 1 + success) / s.count[lanes]
+        return numbers | {"success": success, "commands_completed": share}
+
+    def annotate(self, frame: np.ndarray, lane: int) -> None:
+        """Circles the target tile."""
+        x, y = ((self.state.goal[lane] - PAD) * DEBUG_ZOOM + TILE * DEBUG_ZOOM // 2).tolist()
+        frame[ring(len(frame), x, y, TILE * DEBUG_ZOOM // 2, 2 * DEBUG_ZOOM)] = GREEN

@@ -1,0 +1,93 @@
+"""One environment: a view of a batch of one. No rules and no drawing in here."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+
+from memory_gym_envs.base import ALL, RENDER_MODES
+
+
+class MemoryGymEnv(gym.Env):
+    """A single environment of any id of this package; `gym.make(id)` returns it.
+
+    Arguments: the id, then those of `MemoryGymVectorEnv` but for num_envs, e.g. render_mode, num_levels, start_level.
+    Observations, actions, rewards, options and infos are those of the id, as its family's class describes them.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 25}
+
+    def __init__(self, variant: str, render_mode: str | None = None, **arguments: Any):
+        self.batch = gym.make_vec(
+            variant, num_envs=1, vectorization_mode="vector_entry_point", render_mode=render_mode, **arguments
+        )
+        self.render_mode = render_mode
+        self.metadata = {**type(self).metadata, "render_fps": self.batch.metadata["render_fps"]}
+        self.observation_space = self.batch.single_observation_space
+        self.action_space = self.batch.single_action_space
+        self._needs_reset = True
+
+    def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Starts a new episode: the observation and {"ground_truth": (G,) float64}.
+
+        seed: the level to play; None: the generator goes on (or num_levels chooses). options: reset parameters, for
+        this episode. Raises ValueError for a wrong seed or option; nothing has changed then.
+        """
+        if isinstance(seed, (list, tuple, np.ndarray)):
+            raise ValueError(f"seed must be an integer or None, not {seed!r}")
+        batch = self.batch
+        batch.restart(np.zeros(1, np.intp), batch._lane_seeds(seed), batch.resolve(options))
+        self._needs_reset = False
+        return _only(batch.observe(ALL)), {"ground_truth": batch.ground_truth()[0]}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """One step. The info of an episode's last step also has its summary in plain numbers.
+
+        Raises ValueError for a wrong action, ResetNeeded before the first reset and after an episode's end.
+        """
+        if self._needs_reset:
+            raise gym.error.ResetNeeded("call reset() before step(), at the start and after every episode's end")
+        batch = self.batch
+        lone = action[None] if isinstance(action, (np.ndarray, np.integer)) else [action]
+        rewards, terminations, truncations = batch.advance(batch.checked_actions(lone))
+        terminated, truncated = bool(terminations[0]), bool(truncations[0])
+        info: dict[str, Any] = {}
+        if terminated or truncated:
+            self._needs_reset = True
+            info = {key: values[0].item() for key, values in batch.summary(np.zeros(1, np.intp)).items()}
+        info["ground_truth"] = batch.ground_truth()[0]
+        return _only(batch.observe(ALL)), float(rewards[0]), terminated, truncated, info
+
+    def render(self) -> np.ndarray | None:
+        """The picture that the render mode asks for, or None without one."""
+        pictures = self.batch.render()
+        return None if pictures is None else pictures[0]
+
+    def close(self) -> None:
+        """Releases nothing: no environment holds a window or shares anything with another."""
+        self.batch.close()
+
+    # Gymnasium keeps an environment's generator in these two names; here they are lane 0's.
+
+    @property
+    def _np_random(self) -> np.random.Generator | None:
+        return self.batch.np_random[0]
+
+    @_np_random.setter
+    def _np_random(self, rng: np.random.Generator) -> None:
+        self.batch.set_generator(0, rng)
+
+    @property
+    def _np_random_seed(self) -> int | None:
+        return self.batch.np_random_seed[0]
+
+    @_np_random_seed.setter
+    def _np_random_seed(self, seed: int | None) -> None:
+        self.batch._seeds[0] = seed
+
+
+def _only(observations: Any) -> Any:
+    if isinstance(observations, dict):
+        return {key: value[0] for key, value in observations.items()}
+    return observations[0]
