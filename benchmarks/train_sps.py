@@ -1,0 +1,119 @@
+"""How fast the scripts train, beside the bound that the convolutions alone would allow.
+
+    python benchmarks/train_sps.py --num-steps 128 512
+
+The bound of an iteration is the Atari CNN and nothing else: forward on every step of the rollout, then forward and
+backward on every step of every epoch, in pieces of the best size. A script's iteration is all it does: environments,
+memory, heads, losses and optimizer. Both are timed in turn, several times, and the medians divided, because a
+machine's speed changes from minute to minute.
+"""
+
+import contextlib
+import importlib
+import io
+import os
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+import tyro
+
+sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), ".."))
+
+
+@dataclass
+class Config:
+    """What to measure."""
+
+    script: str = "ppo_gru"
+    """the script, without .py"""
+    env_id: str = "MortarMayhem-Grid-v0"
+    """a Memory Gym id with pixels"""
+    num_envs: int = 32
+    """lanes"""
+    num_steps: list[int] = field(default_factory=lambda: [128, 512])
+    """steps of a rollout, a table row each"""
+    rounds: int = 3
+    """how often bound and script are timed in turn"""
+    chunks: list[int] = field(default_factory=lambda: [64, 128, 256, 512])
+    """sizes of piece that the bound may choose from"""
+    flags: list[str] = field(default_factory=list)
+    """further flags of the script, e.g. --flags=--memory --flags=lstm"""
+
+
+def seconds(work: Callable[[], None], device: torch.device) -> float:
+    """Time one call, the device's queue included."""
+    start = time.perf_counter()
+    work()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter() - start
+
+
+def script_iteration(script, args, run) -> Callable[[], None]:
+    """Return a function that does one training iteration of the script."""
+    optimizer = torch.optim.AdamW(run.agent.parameters(), lr=args.init_lr, fused=True)
+    rollout = script.make_rollout(run.agent, run.obs, args.num_steps, run.device)
+    live = run.agent.memory.initial(args.num_envs, run.device)
+    play = script.Play(run.obs, live, np.zeros(args.num_envs), np.zeros(args.num_envs, np.int64))
+
+    def iteration() -> None:
+        last_value, _ = script.collect(run.agent, run.envs, play, rollout, args, None)
+        script.update(run.agent, optimizer, rollout, last_value, args.init_ent_coef, args)
+
+    return iteration
+
+
+def bound_iteration(script, args, device: torch.device, chunk: int) -> Callable[[], None]:
+    """Return a function that does the convolutions of one iteration and nothing else, in pieces of chunk frames."""
+    cnn = script.AtariCNN(3, chunk).to(device)
+    frames = torch.randint(0, 256, (max(chunk, args.num_envs), 84, 84, 3), dtype=torch.uint8, device=device)
+
+    def iteration() -> None:
+        with torch.no_grad():
+            for _ in range(args.num_steps):
+                cnn(frames[: args.num_envs])
+        for _ in range(args.update_epochs * args.num_envs * args.num_steps // chunk):
+            cnn(frames[:chunk]).sum().backward()
+
+    return iteration
+
+
+def measure(config: Config, num_steps: int) -> tuple[float, float, int]:
+    """Return the steps per second of script and bound, and the bound's best piece size."""
+    script = importlib.import_module(config.script)
+    flags = ["--env-id", config.env_id, "--num-envs", str(config.num_envs), "--num-steps", str(num_steps)]
+    args = tyro.cli(script.Args, args=[*flags, *config.flags])
+    with contextlib.redirect_stderr(io.StringIO()):
+        run = script.setup(args)
+    short = tyro.cli(script.Args, args=[*flags[:-1], "32", *config.flags])
+    trial = {c: bound_iteration(script, short, run.device, c) for c in config.chunks}
+    best = min(config.chunks, key=lambda chunk: min(seconds(trial[chunk], run.device) for _ in range(3)))
+    work = {"script": script_iteration(script, args, run), "bound": bound_iteration(script, args, run.device, best)}
+    work["script"]()  # the first iteration allocates
+    times = {name: [] for name in work}
+    for _ in range(config.rounds):
+        for name, iteration in work.items():
+            times[name].append(seconds(iteration, run.device))
+    run.envs.close()
+    steps = config.num_envs * num_steps
+    return steps / statistics.median(times["script"]), steps / statistics.median(times["bound"]), best
+
+
+def main(config: Config) -> None:
+    """Print a Markdown table, a row per rollout length."""
+    print(f"{config.script} on {config.env_id} {' '.join(config.flags)}, {torch.get_num_threads()} threads\n")
+    print("| lanes x steps | steps/s | bound, steps/s | share of the bound | bound's piece |")
+    print("|---|---|---|---|---|")
+    for num_steps in config.num_steps:
+        speed, bound, chunk = measure(config, num_steps)
+        size = f"{config.num_envs} x {num_steps}"
+        print(f"| {size} | {speed:.0f} | {bound:.0f} | {speed / bound:.2f} | {chunk} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

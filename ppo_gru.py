@@ -1,0 +1,861 @@
+"""PPO that remembers with a recurrent network: GRU, LSTM, or nothing at all for comparison.
+
+    python ppo_gru.py --env-id MortarMayhem-Grid-v0
+
+The agent sees one observation at a time and carries a hidden state from step to step, zeroed where an episode ends.
+While it plays, every step's hidden state is stored. To learn, each lane's steps are cut into pieces at the ends of
+episodes (and every --seq-len steps), padded with zeros to the longest piece and unrolled from the piece's stored
+hidden state: truncated back-propagation through time. The gradient reaches back to the beginning of the piece, never
+further; what the piece was given to start with was computed with the weights of the time, and is not recomputed.
+
+After chapter 5 of "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", called the thesis
+below; numbers in brackets are its equations, defaults are the "Final" column of its table 6.1. Only section 5 knows
+which memory this is.
+
+Shape letters: T steps of a rollout, N lanes (environments in parallel), A action branches, R steps of a minibatch,
+S pieces of a minibatch, L steps of the longest piece, D width of the memory, P hidden vectors per lane.
+"""
+
+import importlib
+import json
+import math
+import os
+import sys
+import time
+from collections import defaultdict, deque
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from typing import Literal
+
+import gymnasium as gym
+import numpy as np
+import torch
+import torch.nn.functional as F
+import tyro
+from gymnasium.vector import AutoresetMode
+from torch import Tensor, nn
+from torch.distributions import Categorical
+from torch.nn.utils.rnn import pad_sequence
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+import memory_gym_envs  # noqa: F401 (registers the Memory Gym ids)
+
+
+# ---- 1 ARGS ----
+@dataclass
+class Args:
+    """Train a PPO agent with a recurrent memory."""
+
+    exp_name: str = "ppo_gru"
+    """name of the experiment, part of the run folder's name"""
+    seed: int = 1
+    """seed of the weights, the actions and the environments: same seed, same curves (on the CPU to the last bit)"""
+    torch_deterministic: bool = True
+    """ask cuDNN for deterministic algorithms"""
+    cuda: bool = True
+    """train on the GPU when there is one"""
+    track: bool = False
+    """log to Weights and Biases too (needs the extra `track`)"""
+    wandb_project_name: str = "memory-gym-baselines"
+    """the project's name at Weights and Biases"""
+    wandb_entity: str | None = None
+    """the team's name at Weights and Biases"""
+    capture_video: bool = False
+    """record some episodes of lane 0 to the run folder (needs the extra `play`)"""
+    save_model: bool = False
+    """write weights and arguments to model.pt in the run folder when training ends"""
+    load_model: str | None = None
+    """start from the weights in this file, written by --save-model"""
+
+    env_id: str = "MortarMayhem-Grid-v0"
+    """any Gymnasium id with Discrete or MultiDiscrete actions and pixels, vectors or a Dict of them as observation"""
+    env_options: str = "{}"
+    """reset parameters of a Memory Gym environment as JSON, e.g. '{"command_count": [4]}'"""
+    num_levels: int = 100_000
+    """how many levels a Memory Gym environment trains on (0: no limit)"""
+    start_level: int = 0
+    """the first of these levels"""
+
+    total_timesteps: int = 163_840_000
+    """steps to train for, all lanes together"""
+    num_envs: int = 32
+    """lanes: environments that play in parallel"""
+    num_steps: int = 512
+    """steps of each lane in one rollout"""
+    num_minibatches: int = 8
+    """minibatches of an epoch"""
+    update_epochs: int = 3
+    """how often each rollout is learned from"""
+    gamma: float = 0.995
+    """discount factor"""
+    gae_lambda: float = 0.95
+    """lambda of generalized advantage estimation"""
+    bootstrap_truncated: bool = False
+    """value the final observation of an episode that a time limit cut short, instead of counting it as ended"""
+    norm_adv: bool = False
+    """normalize the advantages of each minibatch"""
+    clip_coef: float = 0.1
+    """how far the probability ratio, and the value, may move from the rollout's"""
+    clip_vloss: bool = True
+    """clip the value loss too"""
+    vf_coef: float = 0.5
+    """weight of the value loss"""
+    max_grad_norm: float = 0.25
+    """the gradient is scaled down to this norm"""
+    target_kl: float | None = None
+    """end an iteration's learning after the epoch whose mean KL divergence exceeds this"""
+    init_lr: float = 2.75e-4
+    """learning rate at the first step"""
+    final_lr: float = 1.0e-5
+    """learning rate from step --anneal-steps on"""
+    init_ent_coef: float = 1.0e-4
+    """weight of the entropy bonus at the first step"""
+    final_ent_coef: float = 1.0e-6
+    """weight of the entropy bonus from step --anneal-steps on"""
+    anneal_steps: int = 163_840_000
+    """steps over which both decay linearly (0: both keep their initial values)"""
+
+    memory: Literal["gru", "lstm", "none"] = "gru"
+    """what the agent remembers with"""
+    hidden_size: int = 512
+    """width of the hidden state"""
+    num_layers: int = 1
+    """stacked recurrent layers"""
+    seq_len: int = 0
+    """longest piece the gradient flows through (0: the longest episode in the rollout)"""
+
+
+def check_args(args: Args) -> None:
+    """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work."""
+    integers = [("num_levels", 0), ("start_level", 0), ("anneal_steps", 0), ("seq_len", 0), ("seed", 0)]
+    integers += [(name, 1) for name in ("num_envs", "num_steps", "num_minibatches", "update_epochs")]
+    integers += [(name, 1) for name in ("total_timesteps", "hidden_size", "num_layers")]
+    numbers = [("gamma", 0, 1), ("gae_lambda", 0, 1)]
+    numbers += [(name, 0, math.inf) for name in ("vf_coef", "init_lr", "final_lr", "init_ent_coef", "final_ent_coef")]
+    for name, low in integers:
+        if getattr(args, name) < low:
+            raise ValueError(f"{flag(name)} is {getattr(args, name)}; it must be {low} or more")
+    for name, low, high in numbers:
+        if not low <= getattr(args, name) <= high or not math.isfinite(getattr(args, name)):
+            raise ValueError(f"{flag(name)} is {getattr(args, name)}; it must be a number from {low} to {high}")
+    for name in ("clip_coef", "max_grad_norm", "target_kl"):
+        value = getattr(args, name)
+        if value is not None and not value > 0:
+            raise ValueError(f"{flag(name)} is {value}; it must be above 0")
+    batch_size = args.num_envs * args.num_steps
+    if args.total_timesteps < batch_size:
+        raise ValueError(
+            f"--total-timesteps is {args.total_timesteps}, less than one iteration of {batch_size} steps "
+            f"(--num-envs {args.num_envs} x --num-steps {args.num_steps})"
+        )
+    longest = min(args.seq_len or args.num_steps, args.num_steps)
+    if args.num_minibatches * longest > batch_size:
+        raise ValueError(
+            f"--num-minibatches is {args.num_minibatches}, but an iteration is sure of only {batch_size // longest} "
+            f"sequences (up to {longest} of {batch_size} steps each); use fewer minibatches or a shorter --seq-len"
+        )
+
+
+# ---- 2 ENVIRONMENTS ----
+def flag(name: str) -> str:
+    """Return the command line's spelling of a field of Args."""
+    return "--" + name.replace("_", "-")
+
+
+def make_envs(env_id: str, num_envs: int, num_levels: int, start_level: int, video: bool) -> gym.vector.VectorEnv:
+    """Make a vector environment with same-step autoreset: an ended lane's next observation begins a new episode.
+
+    Uses the id's own vector entry point where that resets in the same step, else Gymnasium's synchronous one.
+    Raises gymnasium.error.Error for an unknown id, ImportError for a missing package or module.
+    """
+    module, _, name = env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    spec = gym.spec(name)
+    levels = is_memory_gym(name)
+    kwargs = {"num_levels": num_levels, "start_level": start_level} if levels else {}
+    if video:
+        kwargs["render_mode"] = "debug_rgb_array" if levels else "rgb_array"
+    if spec.vector_entry_point is not None:
+        envs = gym.make_vec(name, num_envs, **kwargs)
+        if envs.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:
+            return envs
+        envs.close()
+    same_step = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    return gym.make_vec(name, num_envs, vectorization_mode="sync", vector_kwargs=same_step, **kwargs)
+
+
+def is_memory_gym(env_id: str) -> bool:
+    """Tell whether the id is one of this repository's environments, which have levels and reset parameters."""
+    return str(gym.spec(env_id.rpartition(":")[2]).entry_point).startswith("memory_gym_envs")
+
+
+def reset_options(env_id: str, env_options: str) -> dict | None:
+    """Parse --env-options; raise ValueError if it is no JSON object or the environment has no such parameters."""
+    try:
+        options = json.loads(env_options)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"--env-options is no JSON ({error}): {env_options}") from None
+    if not isinstance(options, dict):
+        raise ValueError(f'--env-options must be a JSON object such as {{"visual_feedback": false}}, not {env_options}')
+    if options and not is_memory_gym(env_id):
+        raise ValueError(f"--env-options are reset parameters of Memory Gym environments; {env_id} has none")
+    return options or None
+
+
+def first_reset(envs: gym.vector.VectorEnv, seed: int, options: dict | None) -> dict[str, Tensor]:
+    """Seed every lane with its own stream, then begin each lane's first episode; return its observations (N, ...)."""
+    # Neighbouring run seeds must not share lanes, so the lanes' seeds count up from a hash of the run's seed.
+    envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]), options=options)
+    # An explicit seed is a level of its own; from here on the levels come from the training set.
+    obs, _ = envs.reset(options=options)
+    return as_tensors(obs)
+
+
+def observation_spaces(space: gym.Space) -> dict[str, gym.spaces.Box]:
+    """Name the parts of an observation; raise ValueError for a space that the encoder has no layer for."""
+    parts = dict(space.spaces) if isinstance(space, gym.spaces.Dict) else {"observation": space}
+    for name, part in parts.items():
+        pixels = isinstance(part, gym.spaces.Box) and len(part.shape) == 3 and min(part.shape[:2]) >= 36
+        vector = isinstance(part, gym.spaces.Box) and len(part.shape) == 1
+        if not pixels and not vector:
+            raise ValueError(
+                f"the observation space {name}: {part} is not supported; use pixels (height, width, channels) "
+                "of at least 36 x 36, a vector, or a Dict of these"
+            )
+    return parts
+
+
+def action_branches(space: gym.Space) -> list[int]:
+    """Return the number of actions of each branch; raise ValueError for other than Discrete and MultiDiscrete."""
+    if isinstance(space, gym.spaces.Discrete):
+        return [int(space.n)]
+    if isinstance(space, gym.spaces.MultiDiscrete) and space.nvec.ndim == 1:
+        return space.nvec.tolist()
+    raise ValueError(f"the action space {space} is not supported; use Discrete or one-dimensional MultiDiscrete")
+
+
+def to_env_actions(actions: Tensor, space: gym.Space) -> np.ndarray:
+    """Turn branch choices (N, A) into what the environments take: (N,) for Discrete, (N, A) for MultiDiscrete."""
+    actions = actions.cpu().numpy() + space.start  # the first action's number, 0 unless the space says otherwise
+    return actions[:, 0] if isinstance(space, gym.spaces.Discrete) else actions
+
+
+def as_tensors(obs: np.ndarray | dict[str, np.ndarray]) -> dict[str, Tensor]:
+    """Give observations their names of `observation_spaces`, as tensors that share memory with the arrays."""
+    return {k: torch.from_numpy(v) for k, v in (obs if isinstance(obs, dict) else {"observation": obs}).items()}
+
+
+class LaneRecorder:
+    """Writes videos of lane 0, of the episodes that Gymnasium's capped cubic schedule picks (0, 1, 8, 27, ...)."""
+
+    def __init__(self, envs: gym.vector.VectorEnv, folder: str, max_frames: int = 1000):
+        self.envs, self.folder, self.max_frames = envs, folder, max_frames
+        self.episode, self.frames = 0, []
+
+    def capture(self) -> None:
+        """Keep a frame of the episode that is being played, if it is one to record."""
+        from gymnasium.utils.save_video import capped_cubic_video_schedule
+
+        if capped_cubic_video_schedule(self.episode) and len(self.frames) < self.max_frames:
+            self.frames.append(self.envs.render()[0])
+
+    def end_episode(self) -> None:
+        """Write the episode's frames to episode-<number>.mp4 and go on to the next episode."""
+        if self.frames:
+            from moviepy.video.io.ImageSequenceClip import ImageSequenceClip
+
+            os.makedirs(self.folder, exist_ok=True)
+            clip = ImageSequenceClip(self.frames, fps=self.envs.metadata.get("render_fps", 30))
+            clip.write_videofile(os.path.join(self.folder, f"episode-{self.episode}.mp4"), logger=None)
+        self.episode, self.frames = self.episode + 1, []
+
+
+# ---- 3 PURE FUNCTIONS ----
+def layer_init(layer: nn.Module, gain: float = math.sqrt(2)) -> nn.Module:
+    """Initialize a layer's weights orthogonally and its biases with zero; return it."""
+    for name, parameter in layer.named_parameters():
+        nn.init.zeros_(parameter) if "bias" in name else nn.init.orthogonal_(parameter, gain)
+    if isinstance(layer, nn.Linear):
+        # Kept transposed in memory: a CPU multiplies a rollout's few rows by it two to three times as fast.
+        layer.weight.data = layer.weight.data.t().contiguous().t()
+    return layer
+
+
+def anneal(step: int, initial: float, final: float, anneal_steps: int) -> float:
+    """Decay linearly from initial to final over anneal_steps, then stay; without anneal_steps stay at initial."""
+    fraction = min(step / anneal_steps, 1.0) if anneal_steps else 0.0
+    return initial + fraction * (final - initial)
+
+
+def gae(
+    rewards: Tensor,
+    values: Tensor,
+    last_value: Tensor,
+    terminated: Tensor,
+    truncated: Tensor,
+    truncation_values: Tensor,
+    gamma: float,
+    gae_lambda: float,
+) -> Tensor:
+    """Return the advantages (T, N) of generalized advantage estimation (2.34), cut wherever an episode ends.
+
+    last_value (N,) is the value of the observation after the last step. truncation_values (T, N) holds the value of
+    the final observation where a truncated episode is bootstrapped and zero elsewhere; a terminated one never is.
+    """
+    done = terminated | truncated
+    next_values = torch.cat([values[1:], last_value[None]])  # (T, N)
+    next_values = torch.where(done, truncation_values * ~terminated, next_values)
+    deltas = rewards + gamma * next_values - values
+    carry = gamma * gae_lambda * ~done
+    advantages = torch.empty_like(deltas)
+    advantage = torch.zeros_like(last_value)
+    for t in reversed(range(len(deltas))):
+        advantages[t] = advantage = deltas[t] + carry[t] * advantage
+    return advantages
+
+
+def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tensor:
+    """Return the clipped surrogate loss (2.41) of log_ratio (R, A), averaged over branches (5.4) and steps."""
+    ratio, advantages = log_ratio.exp(), advantages[:, None]
+    clipped = ratio.clamp(1 - clip_coef, 1 + clip_coef)
+    return -torch.minimum(ratio * advantages, clipped * advantages).mean()
+
+
+def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: float | None) -> Tensor:
+    """Return the mean squared error of values (R,), clipped around old_values (2.43) unless clip_coef is None."""
+    loss = (values - returns).square()
+    if clip_coef is not None:
+        clipped = old_values + (values - old_values).clamp(-clip_coef, clip_coef)
+        loss = torch.maximum(loss, (clipped - returns).square())
+    return loss.mean()
+
+
+@dataclass
+class Pieces:
+    """Runs of consecutive steps of one lane each. Step t of lane n has the flat index t * N + n."""
+
+    first: Tensor  # (S,) flat index of each piece's first step
+    length: Tensor  # (S,) steps of each piece
+    lanes: int  # N
+
+    @classmethod
+    def cut(cls, begins: Tensor) -> "Pieces":
+        """Cut the rollout of all lanes before every step where begins (T, N) is true; the first step always is."""
+        steps, lanes = begins.shape
+        cuts = begins.T.flatten().nonzero()[:, 0]  # lane after lane, so that a piece's steps are neighbours
+        length = torch.diff(cuts, append=torch.tensor([steps * lanes]))
+        return cls(cuts % steps * lanes + cuts // steps, length, lanes)
+
+    def steps(self) -> Tensor:
+        """Return the flat indices (R,) of all steps, piece after piece."""
+        start = self.length.cumsum(0) - self.length
+        within = torch.arange(int(self.length.sum())) - start.repeat_interleave(self.length)
+        return self.first.repeat_interleave(self.length) + within * self.lanes
+
+    def minibatches(self, count: int) -> Iterator["Pieces"]:
+        """Shuffle the pieces and deal them, whole, into count minibatches of nearly the same number of steps."""
+        order = torch.randperm(len(self.first))
+        first, length = self.first[order], self.length[order]
+        minibatch = (length.cumsum(0) - length) * count // length.sum()
+        for i in range(count):
+            yield Pieces(first[minibatch == i], length[minibatch == i], self.lanes)
+
+
+# ---- 4 ENCODERS AND HEADS ----
+class AtariCNN(nn.Sequential):
+    """The convolutions of Mnih et al. (2015), table 6.2: pixels (B, height, width, channels) to features (B, F)."""
+
+    def __init__(self, channels: int, chunk: int = 256):
+        super().__init__(
+            layer_init(nn.Conv2d(channels, 32, 8, 4)),
+            nn.ReLU(inplace=True),
+            layer_init(nn.Conv2d(32, 64, 4, 2)),
+            nn.ReLU(inplace=True),
+            layer_init(nn.Conv2d(64, 64, 3, 1)),
+            nn.ReLU(inplace=True),
+            nn.Flatten(),
+        )
+        self.chunk = chunk
+        self.to(memory_format=torch.channels_last)  # the order in which the environments deliver pixels
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Encode uint8 pixels, scaled to [0, 1], or float ones as they are."""
+        # A CPU's caches want small batches: the backward pass of 2,048 frames at once takes about 1.5 times as long.
+        chunks = pixels.split(self.chunk) if pixels.device.type == "cpu" else [pixels]
+        features = [super(AtariCNN, self).forward(self.scale(chunk)) for chunk in chunks]
+        return torch.cat(features) if len(features) > 1 else features[0]
+
+    @staticmethod
+    def scale(pixels: Tensor) -> Tensor:
+        """Turn (B, height, width, channels) into float (B, channels, height, width), still channels last in memory."""
+        scaled = pixels.float().mul_(1 / 255) if pixels.dtype == torch.uint8 else pixels
+        return scaled.permute(0, 3, 1, 2)
+
+
+class Encoder(nn.Module):
+    """Encodes each part of an observation, concatenates the features and embeds them in the memory's width (5.1)."""
+
+    def __init__(self, spaces: dict[str, gym.spaces.Box], width: int):
+        super().__init__()
+        self.pixels = [name for name, space in spaces.items() if len(space.shape) == 3]
+        self.vectors = [name for name, space in spaces.items() if len(space.shape) == 1]
+        self.cnns = nn.ModuleList(AtariCNN(spaces[name].shape[2]) for name in self.pixels)
+        with torch.no_grad():
+            blank = [torch.zeros(1, *spaces[name].shape) for name in self.pixels]
+            features = sum(cnn(x).shape[1] for cnn, x in zip(self.cnns, blank, strict=True))
+        if self.vectors:
+            self.mlp = layer_init(nn.Linear(sum(spaces[name].shape[0] for name in self.vectors), 128))
+            features += 128
+        self.embedding = layer_init(nn.Linear(features, width))
+
+    def forward(self, obs: dict[str, Tensor]) -> Tensor:
+        """Encode observations of B steps, each part (B, ...), to (B, D)."""
+        features = [cnn(obs[name]) for cnn, name in zip(self.cnns, self.pixels, strict=True)]
+        if self.vectors:
+            features.append(F.relu(self.mlp(torch.cat([obs[name] for name in self.vectors], -1))))
+        features = torch.cat(features, -1) if len(features) > 1 else features[0]
+        return F.relu(self.embedding(features))
+
+
+class Heads(nn.Module):
+    """The layer after the memory, the multi-discrete policy and the state value (table 6.2)."""
+
+    def __init__(self, width: int, branches: list[int]):
+        super().__init__()
+        self.branches = branches
+        self.trunk = layer_init(nn.Linear(width, 512))
+        self.policy = nn.Sequential(
+            layer_init(nn.Linear(512, 512)), nn.ReLU(inplace=True), layer_init(nn.Linear(512, sum(branches)), 0.1)
+        )
+        self.value = nn.Sequential(
+            layer_init(nn.Linear(512, 512)), nn.ReLU(inplace=True), layer_init(nn.Linear(512, 1), 1.0)
+        )
+
+    def forward(self, x: Tensor) -> tuple[list[Categorical], Tensor]:
+        """Map what the memory says, (B, D), to a distribution of each action branch and to values (B,)."""
+        x = F.relu(self.trunk(x))
+        logits = self.policy(x).split(self.branches, -1)
+        return [Categorical(logits=part, validate_args=False) for part in logits], self.value(x)[:, 0]
+
+
+# ---- 5 MEMORY ----
+class Memory(nn.Module):
+    """A stack of GRU or LSTM layers, or nothing (thesis 5.2).
+
+    The live memory of a lane is P hidden vectors of width D: one a layer for the GRU, two (hidden, then cell state)
+    for the LSTM, none without memory. A rollout stores, of every step, the live memory that the step began with.
+    """
+
+    def __init__(self, args: Args):
+        super().__init__()
+        self.seq_len, self.width = args.seq_len, args.hidden_size
+        self.kind = args.memory
+        self.hidden_vectors = args.num_layers * {"gru": 1, "lstm": 2, "none": 0}[args.memory]
+        if args.memory != "none":
+            rnn = nn.GRU if args.memory == "gru" else nn.LSTM
+            # The outputs are activated already: another ReLU behind them would throw half of them away (5.2.4).
+            self.rnn = layer_init(rnn(self.width, self.width, args.num_layers, batch_first=True), 1.0)
+
+    def initial(self, lanes: int, device: torch.device) -> Tensor:
+        """Return the live memory (N, P, D) of fresh episodes."""
+        return torch.zeros(lanes, self.hidden_vectors, self.width, device=device)
+
+    def step(self, x: Tensor, live: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Take one step of all lanes: x (N, D) to (N, D), the new live memory, and what to store of this step."""
+        y, new_live = self.run(x[:, None], live)
+        return y[:, 0], new_live, live
+
+    def reset(self, live: Tensor, done: Tensor) -> Tensor:
+        """Forget the lanes whose episode ended, where done (N,) is true."""
+        return live.masked_fill(done[:, None, None], 0.0)
+
+    def cut(self, done: Tensor) -> Pieces:
+        """Cut a rollout, whose episodes end where done (T, N) is true, into the pieces that minibatches are made of."""
+        begins = torch.ones_like(done)
+        if self.kind == "none":
+            return Pieces.cut(begins)
+        begins[1:] = done[:-1]
+        if self.seq_len:
+            now = torch.arange(len(done))[:, None]
+            began = torch.where(begins, now, 0).cummax(0).values  # (T, N) the step that the episode began at
+            begins = (now - began) % self.seq_len == 0
+        return Pieces.cut(begins)
+
+    def unroll(self, x: Tensor, pieces: Pieces, stored: Tensor) -> Tensor:
+        """Run whole pieces at once: x (R, D) to (R, D), from the stored (T, N, P, D) memory of their first steps."""
+        live = stored.flatten(0, 1)[pieces.first.to(x.device)]  # (S, P, D)
+        padded = pad_sequence(x.split(pieces.length.tolist()), batch_first=True)  # (S, L, D)
+        y, _ = self.run(padded, live)
+        # The padding ends here: what follows, the losses' means (5.8) included, sees real steps only.
+        real = torch.arange(padded.shape[1]) < pieces.length[:, None]  # (S, L)
+        return y[real.to(x.device)]
+
+    def run(self, x: Tensor, live: Tensor) -> tuple[Tensor, Tensor]:
+        """Run the recurrent layers over x (S, L, D) from the live memory (S, P, D); return both anew."""
+        if self.kind == "none":
+            return x, live
+        state = live.transpose(0, 1).contiguous()  # (P, S, D)
+        if self.kind == "gru":
+            y, state = self.rnn(x, state)
+        else:
+            y, state = self.rnn(x, state.chunk(2))
+            state = torch.cat(state)
+        return y, state.transpose(0, 1)
+
+    def padding_fraction(self, pieces: Pieces) -> float:
+        """Return the share of the padded (S, L) that is padding."""
+        return 1 - float(pieces.length.float().mean() / pieces.length.max())
+
+
+# ---- 6 AGENT ----
+class Agent(nn.Module):
+    """Encoder, memory and heads. Plays step by step with `act`, learns from whole pieces with `evaluate`."""
+
+    def __init__(self, observation_space: gym.Space, action_space: gym.Space, args: Args):
+        super().__init__()
+        self.memory = Memory(args)
+        self.encoder = Encoder(observation_spaces(observation_space), self.memory.width)
+        self.heads = Heads(self.memory.width, action_branches(action_space))
+
+    def act(self, obs: dict[str, Tensor], live: Tensor) -> tuple[list[Categorical], Tensor, Tensor, Tensor]:
+        """Take one step of all lanes: the action distributions, values (N,), new live memory, and what to store."""
+        x, live, item = self.memory.step(self.encoder(obs), live)
+        return *self.heads(x), live, item
+
+    def evaluate(self, obs: dict[str, Tensor], pieces: Pieces, stored: Tensor) -> tuple[list[Categorical], Tensor]:
+        """Recompute the action distributions and values (R,) of the steps of the pieces, in the pieces' order."""
+        return self.heads(self.memory.unroll(self.encoder(obs), pieces, stored))
+
+
+def save_model(agent: Agent, args: Args, path: str) -> None:
+    """Write weights and arguments to path, whole or not at all."""
+    torch.save({"args": asdict(args), "weights": agent.state_dict()}, path + ".part")
+    os.replace(path + ".part", path)
+
+
+def load_model(path: str) -> tuple[Args, dict[str, Tensor]]:
+    """Read the arguments and the weights, on the CPU, of a file that `save_model` wrote.
+
+    Raises ValueError if the file is not such a file, OSError if it cannot be read.
+    """
+    with open(path, "rb") as file:
+        try:
+            saved = torch.load(file, map_location="cpu", weights_only=True)
+            known = {field.name for field in fields(Args)}
+            return Args(**{k: v for k, v in saved["args"].items() if k in known}), saved["weights"]
+        except Exception:  # what torch.load raises for a file of another kind is many things, and none tells more
+            raise ValueError(f"{path} is not a model that --save-model wrote") from None
+
+
+def load_weights(agent: Agent, path: str) -> None:
+    """Give the agent the weights in the file; raise ValueError if they belong to another network."""
+    saved_args, weights = load_model(path)
+    try:
+        agent.load_state_dict(weights)
+    except RuntimeError:
+        raise ValueError(
+            f"{path} holds another network (trained with --env-id {saved_args.env_id} --memory {saved_args.memory} "
+            f"--hidden-size {saved_args.hidden_size} --num-layers {saved_args.num_layers}); train with these flags"
+        ) from None
+
+
+# ---- 7 TRAINING ----
+@dataclass
+class Rollout:
+    """What T steps of N lanes leave behind to learn from, on the device; overwritten by every iteration."""
+
+    obs: dict[str, Tensor]  # each (T, N, ...): uint8 pixels stay uint8
+    actions: Tensor  # (T, N, A)
+    log_probs: Tensor  # (T, N, A)
+    values: Tensor  # (T, N)
+    rewards: Tensor  # (T, N)
+    terminated: Tensor  # (T, N) the step ended its episode
+    truncated: Tensor  # (T, N) the step ended its episode by a time limit
+    truncation_values: Tensor  # (T, N) value of the final observation, where bootstrapped
+    memory: Tensor  # (T, N, ...) what the memory stores of each step
+
+
+def make_rollout(agent: Agent, obs: dict[str, Tensor], num_steps: int, device: torch.device) -> Rollout:
+    """Allocate a rollout for observations like obs, (N, ...) each."""
+    lanes = len(next(iter(obs.values())))
+
+    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.zeros(num_steps, lanes, *shape, dtype=dtype, device=device)
+
+    stored = {name: empty(*part.shape[1:], dtype=part.dtype) for name, part in on_device(obs, device).items()}
+    item = agent.memory.initial(lanes, device)
+    branches = len(agent.heads.branches)
+    return Rollout(
+        obs=stored,
+        actions=empty(branches, dtype=torch.int64),
+        log_probs=empty(branches),
+        values=empty(),
+        rewards=empty(),
+        terminated=empty(dtype=torch.bool),
+        truncated=empty(dtype=torch.bool),
+        truncation_values=empty(),
+        memory=empty(*item.shape[1:]),
+    )
+
+
+@dataclass
+class Play:
+    """Where the lanes are between two rollouts."""
+
+    obs: dict[str, Tensor]  # (N, ...) the observations to act on next
+    live: Tensor  # the live memory
+    returns: np.ndarray  # (N,) undiscounted return of each lane's episode so far
+    lengths: np.ndarray  # (N,) steps of each lane's episode so far
+
+
+@torch.no_grad()
+def collect(
+    agent: Agent, envs: gym.vector.VectorEnv, play: Play, rollout: Rollout, args: Args, recorder: LaneRecorder | None
+) -> tuple[Tensor, dict[str, list[float]]]:
+    """Play T steps of all lanes into the rollout; return the value (N,) of what follows, and the ended episodes.
+
+    The episodes are lists of numbers by name: charts/episodic_return, charts/episodic_length, and episode/* for every
+    number in the environment's final info. Leaves `play` where the next rollout goes on.
+    """
+    device, episodes = rollout.values.device, defaultdict(list)
+    for t in range(args.num_steps):
+        for name, part in play.obs.items():
+            rollout.obs[name][t] = part  # the first and only copy: env to device, dtype kept
+        obs = {name: part[t] for name, part in rollout.obs.items()}
+        policy, rollout.values[t], live, rollout.memory[t] = agent.act(obs, play.live)
+        actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
+        rollout.actions[t], rollout.log_probs[t] = actions, log_probs_of(policy, actions)
+        if recorder is not None:
+            recorder.capture()
+
+        obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
+        play.obs = as_tensors(obs)
+        rollout.rewards[t] = torch.as_tensor(rewards)
+        rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
+        if args.bootstrap_truncated and truncated.any():
+            final = on_device(final_observations(play.obs, infos, truncated), device)
+            rollout.truncation_values[t] = agent.act(final, live)[1]  # the memory as it was before the reset
+
+        done = terminated | truncated
+        play.live = agent.memory.reset(live, torch.as_tensor(done, device=device))
+        note_episodes(play, rewards, done, infos, episodes)
+        if recorder is not None and done[0]:
+            recorder.end_episode()
+    _, last_value, _, _ = agent.act(on_device(play.obs, device), play.live)
+    return last_value, episodes
+
+
+def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
+    """Return the log-probability (B, A) of the chosen action (B, A) of every branch."""
+    return torch.stack([branch.log_prob(action) for branch, action in zip(policy, actions.unbind(-1), strict=True)], -1)
+
+
+def on_device(obs: dict[str, Tensor], device: torch.device) -> dict[str, Tensor]:
+    """Move observations to the device, as the encoder takes them."""
+    return {k: v.to(device, v.dtype if v.dtype == torch.uint8 else torch.float32) for k, v in obs.items()}
+
+
+def final_observations(obs: dict[str, Tensor], infos: dict, lanes: np.ndarray) -> dict[str, Tensor]:
+    """Return observations (N, ...) in which the given lanes hold the last one of the episode that just ended."""
+    obs = {name: part.clone() for name, part in obs.items()}
+    for lane in lanes.nonzero()[0]:
+        for name, part in as_tensors(infos["final_obs"][lane]).items():
+            obs[name][lane] = part
+    return obs
+
+
+def note_episodes(play: Play, rewards: np.ndarray, done: np.ndarray, infos: dict, episodes: dict[str, list]) -> None:
+    """Count the step in every lane's return and length; move those of ended episodes to the lists in episodes."""
+    play.returns += rewards
+    play.lengths += 1
+    if not done.any():
+        return
+    episodes["charts/episodic_return"] += play.returns[done].tolist()
+    episodes["charts/episodic_length"] += play.lengths[done].tolist()
+    play.returns[done], play.lengths[done] = 0, 0
+    for name, values in infos.get("final_info", {}).items():
+        is_number = isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "biuf"
+        if is_number and not name.startswith("_"):
+            episodes[f"episode/{name}"] += values[done & infos["final_info"][f"_{name}"]].tolist()
+
+
+def minibatch_loss(
+    agent: Agent, rollout: Rollout, targets: tuple[Tensor, Tensor], pieces: Pieces, ent_coef: float, args: Args
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the total loss (5.7) of the pieces' steps and the numbers to log; targets: advantages, returns (T, N)."""
+    steps = pieces.steps().to(rollout.values.device)  # (R,)
+
+    def take(stored: Tensor) -> Tensor:
+        return stored.flatten(0, 1)[steps]
+
+    policy, values = agent.evaluate({k: take(v) for k, v in rollout.obs.items()}, pieces, rollout.memory)
+    log_ratio = log_probs_of(policy, take(rollout.actions)) - take(rollout.log_probs)  # (R, A)
+    entropy = torch.stack([branch.entropy() for branch in policy], -1).sum(-1).mean()
+    advantages, returns = map(take, targets)
+    if args.norm_adv:
+        advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+    pg_loss = policy_loss(log_ratio, advantages, args.clip_coef)
+    v_loss = value_loss(values, take(rollout.values), returns, args.clip_coef if args.clip_vloss else None)
+    loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
+    with torch.no_grad():
+        off, joint = log_ratio.exp() - 1, log_ratio.sum(-1)  # the branches are independent: log-ratios add up
+        logs = {
+            "losses/policy_loss": pg_loss,
+            "losses/value_loss": v_loss,
+            "losses/entropy": entropy,
+            "losses/loss": loss,
+            "losses/old_approx_kl": -joint.mean(),
+            "losses/approx_kl": (joint.exp() - 1 - joint).mean(),  # http://joschu.net/blog/kl-approx.html
+            "losses/clipfrac": (off.abs() > args.clip_coef).float().mean(),
+            "losses/ratio_error": off.abs().max(),
+        }
+    return loss, {name: value.detach() for name, value in logs.items()}
+
+
+def update(
+    agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, last_value: Tensor, ent_coef: float, args: Args
+) -> dict[str, float]:
+    """Learn from the rollout for some epochs; return what to log, averaged over the minibatches."""
+    advantages = gae(
+        *(rollout.rewards, rollout.values, last_value, rollout.terminated, rollout.truncated),
+        *(rollout.truncation_values, args.gamma, args.gae_lambda),
+    )
+    returns = advantages + rollout.values
+    pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
+    logs, padding = [], []
+    for _ in range(args.update_epochs):
+        for minibatch in pieces.minibatches(args.num_minibatches):
+            loss, log = minibatch_loss(agent, rollout, (advantages, returns), minibatch, ent_coef, args)
+            optimizer.zero_grad()
+            loss.backward()
+            log["losses/grad_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+            optimizer.step()
+            logs.append(log)
+            padding.append(agent.memory.padding_fraction(minibatch))
+        epoch_kl = torch.stack([log["losses/approx_kl"] for log in logs[-args.num_minibatches :]]).mean()
+        if args.target_kl is not None and epoch_kl > args.target_kl:
+            break
+    means = {name: torch.stack([log[name] for log in logs]).mean().item() for name in logs[0]}
+    # Before the first gradient step the weights are the rollout's, and so must be every probability.
+    means["losses/ratio_error"] = logs[0]["losses/ratio_error"].item()
+    means["losses/explained_variance"] = explained_variance(rollout.values, returns)
+    means["charts/padding_fraction"] = float(np.mean(padding))
+    return means
+
+
+def explained_variance(values: Tensor, returns: Tensor) -> float:
+    """Return the share of the returns' variance that the values explain; NaN if the returns do not vary."""
+    variance = returns.var().item()
+    return 1 - (returns - values).var().item() / variance if variance > 0 else math.nan
+
+
+@dataclass
+class Run:
+    """All that training needs, made by `setup` from an Args."""
+
+    envs: gym.vector.VectorEnv
+    agent: Agent
+    obs: dict[str, Tensor]  # (N, ...) the first observations
+    device: torch.device
+    folder: str
+    writer: SummaryWriter
+
+
+def setup(args: Args) -> Run:
+    """Check the arguments and make everything, the run folder last: bad input raises before anything is written.
+
+    Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
+    """
+    check_args(args)
+    torch.manual_seed(args.seed)
+    torch.backends.cudnn.deterministic = args.torch_deterministic
+    device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
+    if args.capture_video:
+        importlib.import_module("moviepy")
+    if args.track:
+        importlib.import_module("wandb")
+
+    envs = make_envs(args.env_id, args.num_envs, args.num_levels, args.start_level, args.capture_video)
+    if envs.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
+        raise ValueError(f"{args.env_id} does not reset an ended episode in the same step")
+    agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(device)
+    if args.load_model is not None:
+        load_weights(agent, args.load_model)
+    obs = first_reset(envs, args.seed, reset_options(args.env_id, args.env_options))
+
+    name = f"{args.env_id.replace('/', '-').replace(':', '-')}__{args.exp_name}__{args.seed}__{int(time.time())}"
+    folder = os.path.join("runs", name)
+    os.makedirs(folder)
+    if args.track:
+        start_tracking(args, name)
+    writer = SummaryWriter(folder)
+    rows = "\n".join(f"|{key}|{value}|" for key, value in asdict(args).items())
+    writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
+    return Run(envs, agent, obs, device, folder, writer)
+
+
+def start_tracking(args: Args, name: str) -> None:
+    """Mirror the TensorBoard curves to Weights and Biases."""
+    wandb = importlib.import_module("wandb")
+    wandb.init(
+        project=args.wandb_project_name,
+        entity=args.wandb_entity,
+        sync_tensorboard=True,
+        config=asdict(args),
+        name=name,
+        save_code=True,
+    )
+
+
+def train(args: Args, run: Run) -> str:
+    """Train for --total-timesteps, rounded down to whole iterations; return the run folder."""
+    agent, device = run.agent, run.device
+    optimizer = torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)
+    rollout = make_rollout(agent, run.obs, args.num_steps, device)
+    play = Play(
+        run.obs, agent.memory.initial(args.num_envs, device), np.zeros(args.num_envs), np.zeros(args.num_envs, np.int64)
+    )
+    recorder = LaneRecorder(run.envs, os.path.join(run.folder, "videos")) if args.capture_video else None
+    recent = {"return": deque(maxlen=100), "length": deque(maxlen=100)}
+    batch_size = args.num_envs * args.num_steps
+    start = time.perf_counter()
+    with tqdm(total=args.total_timesteps // batch_size * batch_size, unit=" steps", unit_scale=True) as bar:
+        for step in range(0, bar.total, batch_size):
+            schedule = {
+                "charts/learning_rate": anneal(step, args.init_lr, args.final_lr, args.anneal_steps),
+                "charts/entropy_coefficient": anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps),
+            }
+            optimizer.param_groups[0]["lr"] = schedule["charts/learning_rate"]
+            last_value, episodes = collect(agent, run.envs, play, rollout, args, recorder)
+            losses = update(agent, optimizer, rollout, last_value, schedule["charts/entropy_coefficient"], args)
+
+            bar.update(batch_size)
+            speed = bar.n / (time.perf_counter() - start)
+            means = {name: float(np.mean(values)) for name, values in episodes.items()}
+            for name, value in {**schedule, **losses, **means, "charts/SPS": speed}.items():
+                run.writer.add_scalar(name, value, bar.n)
+            for name, window in recent.items():
+                window.extend(episodes.get(f"charts/episodic_{name}", []))
+            shown = {name: f"{np.mean(window):.2f}" for name, window in recent.items() if window}
+            bar.set_postfix({**shown, "SPS": f"{speed:.0f}"})
+    if args.save_model:
+        save_model(agent, args, os.path.join(run.folder, "model.pt"))
+    run.writer.close()
+    run.envs.close()
+    return run.folder
+
+
+def main(args: Args) -> str:
+    """Train an agent as the arguments say; return the run folder."""
+    return train(args, setup(args))
+
+
+if __name__ == "__main__":
+    args = tyro.cli(Args)
+    try:
+        run = setup(args)
+    except (ValueError, OSError, ImportError, gym.error.Error) as error:
+        sys.exit(f"{os.path.basename(__file__)}: {' '.join(str(error).split())}")
+    train(args, run)

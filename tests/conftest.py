@@ -1,0 +1,55 @@
+import cue_recall  # noqa: F401 (registers CueRecall-v0)
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import ppo_gru
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path, monkeypatch):
+    """Let every test write its runs to a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def tiny():
+    """Arguments for a training of two short iterations; keyword arguments replace some of them."""
+
+    def make(**changes):
+        few = {"num_envs": 4, "num_steps": 16, "num_minibatches": 2, "update_epochs": 2, "hidden_size": 32}
+        return ppo_gru.Args(**{"cuda": False, "total_timesteps": 128, **few, **changes})
+
+    return make
+
+
+@pytest.fixture
+def scalars():
+    """Read a run folder's curves: a list of values by name."""
+
+    def read(folder):
+        events = EventAccumulator(folder)
+        events.Reload()
+        return {name: [point.value for point in events.Scalars(name)] for name in events.Tags()["scalars"]}
+
+    return read
+
+
+@pytest.fixture
+def played(tiny):
+    """Set up an agent and play some rollouts, without learning; the last one is kept in rollout."""
+
+    def play(iterations=1, weights_scale=1.0, **changes):
+        args = tiny(**changes)
+        run = ppo_gru.setup(args)
+        with torch.no_grad():  # the initial policy hardly depends on its input; a test needs one that does
+            for parameter in run.agent.heads.parameters():
+                parameter.mul_(weights_scale)
+        rollout = ppo_gru.make_rollout(run.agent, run.obs, args.num_steps, run.device)
+        live = run.agent.memory.initial(args.num_envs, run.device)
+        state = ppo_gru.Play(run.obs, live, *torch.zeros(2, args.num_envs).numpy())
+        for _ in range(iterations):
+            last_value, episodes = ppo_gru.collect(run.agent, run.envs, state, rollout, args, None)
+        return args, run, rollout, state, last_value, episodes
+
+    return play

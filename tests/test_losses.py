@@ -1,0 +1,45 @@
+"""Losses and schedules against values worked out by hand."""
+
+import math
+
+import pytest
+import torch
+
+from ppo_gru import anneal, explained_variance, policy_loss, value_loss
+
+
+def test_policy_loss_clips_every_branch_by_itself():
+    # One step, advantage 2, ratios 1.5 and 0.9 at clip 0.1: min(3, 2.2) and min(1.8, 1.8).
+    log_ratio = torch.tensor([[math.log(1.5), math.log(0.9)]])
+    assert policy_loss(log_ratio, torch.tensor([2.0]), 0.1).item() == pytest.approx(-(2.2 + 1.8) / 2)
+    # A negative advantage takes the pessimistic side: min(-3, -2.2) and min(-1.8, -1.8).
+    assert policy_loss(log_ratio, torch.tensor([-2.0]), 0.1).item() == pytest.approx((3.0 + 1.8) / 2)
+
+
+def test_policy_gradient_vanishes_only_in_the_clipped_branch():
+    log_ratio = torch.tensor([[math.log(1.5), 0.0]], requires_grad=True)
+    policy_loss(log_ratio, torch.tensor([1.0]), 0.1).backward()
+    assert log_ratio.grad.tolist() == [[0.0, -0.5]]
+
+
+def test_value_loss_is_the_larger_of_clipped_and_unclipped():
+    values, old, returns = torch.tensor([1.0, 0.0]), torch.tensor([0.0, 0.0]), torch.tensor([2.0, 1.0])
+    # The first value moved by 1, clipped to 0.1: max((1 - 2)^2, (0.1 - 2)^2); the second did not move.
+    assert value_loss(values, old, returns, 0.1).item() == pytest.approx((1.9**2 + 1.0) / 2)
+    assert value_loss(values, old, returns, None).item() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("step", "expected"), [(0, 1.0), (50, 0.6), (100, 0.2), (1000, 0.2)])
+def test_anneal_decays_linearly_then_stays(step, expected):
+    assert anneal(step, 1.0, 0.2, 100) == pytest.approx(expected)
+
+
+def test_no_anneal_steps_keep_the_initial_value():
+    assert anneal(10**9, 1.0, 0.2, 0) == 1.0
+
+
+def test_explained_variance():
+    returns = torch.tensor([0.0, 1.0, 2.0, 3.0])
+    assert explained_variance(returns, returns) == 1.0
+    assert explained_variance(torch.zeros(4), returns) == pytest.approx(0.0)
+    assert math.isnan(explained_variance(returns, torch.ones(4)))

@@ -1,0 +1,174 @@
+"""The invariants of a memory: what the update recomputes is what the rollout saw, and nothing leaks."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+
+import ppo_gru
+
+MEMORIES = [
+    {"memory": "gru"},
+    {"memory": "gru", "num_layers": 2, "seq_len": 5},
+    {"memory": "lstm"},
+    {"memory": "lstm", "num_layers": 2, "seq_len": 5},
+    {"memory": "none"},
+]
+
+
+def recompute(run, rollout):
+    """Evaluate the whole rollout in one batch of pieces; return the pieces' steps, ratios and values."""
+    pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
+    steps = pieces.steps()
+    obs = {name: part.flatten(0, 1)[steps] for name, part in rollout.obs.items()}
+    policy, values = run.agent.evaluate(obs, pieces, rollout.memory)
+    log_probs = ppo_gru.log_probs_of(policy, rollout.actions.flatten(0, 1)[steps])
+    return pieces, steps, (log_probs - rollout.log_probs.flatten(0, 1)[steps]).exp(), values
+
+
+@pytest.mark.parametrize("env_id", ["CueRecall-v0", "MortarMayhemB-Grid-v0", "Endless-MortarMayhem-v0"])
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_ratio_is_one_for_every_sample(played, env_id, memory):
+    # Three rollouts of 16 steps: episodes end inside them and go on from one to the next.
+    _, run, rollout, *_ = played(iterations=3, weights_scale=3.0, env_id=env_id, **memory)
+    _, steps, ratio, values = recompute(run, rollout)
+    assert (ratio - 1).abs().max() < 1e-5
+    torch.testing.assert_close(values, rollout.values.flatten(0, 1)[steps], atol=1e-5, rtol=0)
+    if env_id == "CueRecall-v0":
+        assert rollout.terminated.any()
+        assert not rollout.terminated[-1].all()
+
+
+@pytest.mark.parametrize("memory", MEMORIES[:-1])
+def test_ratio_error_sees_a_broken_memory(played, memory):
+    """Guards the guard: with the stored hidden states lost, the ratios are off."""
+    _, run, rollout, *_ = played(iterations=3, weights_scale=3.0, env_id="CueRecall-v0", **memory)
+    rollout.memory.zero_()
+    assert (recompute(run, rollout)[2] - 1).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_bootstrap_value_is_the_next_step_s_value(played, memory):
+    args, run, rollout, state, last_value, _ = played(iterations=2, env_id="CueRecall-v0", **memory)
+    ppo_gru.collect(run.agent, run.envs, state, rollout, args, None)
+    torch.testing.assert_close(rollout.values[0], last_value, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("memory", MEMORIES[:-1])
+def test_an_episode_begins_with_an_empty_memory(played, memory):
+    _, _, rollout, *_ = played(env_id="CueRecall-v0", **memory)
+    begins = rollout.terminated[:-1]
+    assert begins.any()
+    assert (rollout.memory[1:][begins] == 0).all()
+    assert (rollout.memory[1:][~begins].abs().sum((-1, -2)) > 0).all(), "and goes on where none ended"
+    assert (rollout.memory[0] == 0).all()
+
+
+def gradients(agent):
+    return torch.cat([parameter.grad.flatten() for parameter in agent.parameters() if parameter.grad is not None])
+
+
+@pytest.mark.parametrize("memory", MEMORIES[:-1])
+@pytest.mark.parametrize("fill", [1e6, float("nan")])
+def test_padding_changes_nothing(played, memory, fill, monkeypatch):
+    args, run, rollout, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
+    targets = rollout.rewards - rollout.values, rollout.rewards
+
+    def learn():
+        pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
+        assert pieces.length.min() < pieces.length.max(), "there is padding"
+        run.agent.zero_grad()
+        loss, _ = ppo_gru.minibatch_loss(run.agent, rollout, targets, pieces, 1e-3, args)
+        loss.backward()
+        return recompute(run, rollout)[2:], loss.detach(), gradients(run.agent)
+
+    clean = learn()
+    pad = ppo_gru.pad_sequence
+    monkeypatch.setattr(ppo_gru, "pad_sequence", lambda x, batch_first: pad(x, batch_first, padding_value=fill))
+    filled = learn()
+    torch.testing.assert_close(filled[0], clean[0], atol=0, rtol=0)
+    torch.testing.assert_close(filled[1], clean[1], atol=0, rtol=0)
+    if math.isfinite(fill):  # a gradient of zero through NaN is NaN by arithmetic, whoever multiplies
+        torch.testing.assert_close(filled[2], clean[2], atol=1e-8, rtol=1e-6)
+
+
+@pytest.mark.parametrize("memory", MEMORIES[:-1])
+def test_no_gradient_crosses_the_end_of_an_episode(played, memory):
+    """The value of an episode's first step depends on that step alone, later ones on all steps of their piece."""
+    _, run, rollout, *_ = played(env_id="CueRecall-v0", **memory)
+    pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
+    x = torch.randn(int(pieces.length.sum()), 32, requires_grad=True)
+    y = run.agent.memory.unroll(x, pieces, rollout.memory)
+    ends = pieces.length.cumsum(0)
+    piece = int((pieces.length > 2).nonzero()[1, 0])
+    first, last = int(ends[piece] - pieces.length[piece]), int(ends[piece] - 1)
+    for output, inputs in ((first, [first]), (last, list(range(first, last + 1)))):
+        (grad,) = torch.autograd.grad(y[output].sum(), x, retain_graph=True)
+        assert grad.abs().sum(-1).nonzero()[:, 0].tolist() == inputs
+
+
+def test_gru_equals_a_loop_over_cells():
+    torch.manual_seed(0)
+    memory = ppo_gru.Memory(ppo_gru.Args(hidden_size=8)).double()
+    cell = torch.nn.GRUCell(8, 8).double()
+    cell.load_state_dict({name.removesuffix("_l0"): value for name, value in memory.rnn.state_dict().items()})
+    x, live = torch.randn(3, 6, 8).double(), torch.randn(3, 1, 8).double()
+    y, after = memory.run(x, live)
+    h = live[:, 0]
+    for t in range(6):
+        h = cell(x[:, t], h)
+        torch.testing.assert_close(y[:, t], h, atol=1e-12, rtol=0)
+    torch.testing.assert_close(after[:, 0], h, atol=1e-12, rtol=0)
+
+
+def test_the_encoder_sees_each_step_once_an_epoch_and_no_padding(played, monkeypatch):
+    args, run, rollout, _, last_value, _ = played(env_id="CueRecall-v0")
+    rows, runs = [], []
+    run.agent.encoder.register_forward_pre_hook(lambda _, inputs: rows.append(len(inputs[0]["observation"])))
+    unroll = run.agent.memory.run
+    monkeypatch.setattr(run.agent.memory, "run", lambda x, live: (runs.append(1), unroll(x, live))[1])
+    optimizer = torch.optim.SGD(run.agent.parameters(), lr=0.0)
+    ppo_gru.update(run.agent, optimizer, rollout, last_value, 0.0, args)
+    assert sum(rows) == args.update_epochs * args.num_envs * args.num_steps
+    assert len(runs) == args.update_epochs * args.num_minibatches, "no loop over time"
+    rows.clear()
+    live = run.agent.memory.initial(args.num_envs, run.device)
+    ppo_gru.collect(run.agent, run.envs, ppo_gru.Play(run.obs, live, np.zeros(4), np.zeros(4)), rollout, args, None)
+    assert rows == [args.num_envs] * (args.num_steps + 1), "no loop over lanes"
+
+
+def test_storage_does_not_grow_and_pixels_stay_bytes(played):
+    args, _, rollout, *_ = played(iterations=3, env_id="Endless-MortarMayhem-v0", hidden_size=8)
+    assert rollout.obs["observation"].dtype == torch.uint8
+    assert rollout.obs["observation"].shape == (args.num_steps, args.num_envs, 84, 84, 3)
+    assert rollout.memory.shape == (args.num_steps, args.num_envs, 1, 8)
+
+
+def test_truncation_bootstraps_with_the_final_observation_and_the_memory_before_the_reset(played):
+    options = '{"max_steps": 5}'
+    changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": options, "seed": 3}
+    args, run, rollout, *_ = played(bootstrap_truncated=True, **changes)
+    assert rollout.truncated[4].all()
+    assert not rollout.terminated.any()
+    assert (rollout.truncation_values != 0).equal(rollout.truncated)
+    # The same actions played again: the final observation, and the memory that five steps left behind.
+    live = torch.zeros_like(rollout.memory[0])
+    for t in range(5):
+        *_, live, _ = run.agent.act({"observation": rollout.obs["observation"][t]}, live)
+    envs = ppo_gru.make_envs(args.env_id, args.num_envs, args.num_levels, args.start_level, False)
+    ppo_gru.first_reset(envs, args.seed, {"max_steps": 5})
+    for t in range(5):
+        *_, infos = envs.step(rollout.actions[t].numpy())
+    final = {"observation": torch.from_numpy(np.stack(infos["final_obs"]))}
+    torch.testing.assert_close(rollout.truncation_values[4], run.agent.act(final, live)[1].detach(), atol=1e-6, rtol=0)
+    _, _, plain, *_ = played(**changes)
+    assert (plain.truncation_values == 0).all()
+
+
+def test_autoreset_is_in_the_same_step():
+    for env_id in ("MortarMayhem-Grid-v0", "CueRecall-v0", "CartPole-v1"):
+        envs = ppo_gru.make_envs(env_id, 2, 10, 0, False)
+        assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+        envs.close()

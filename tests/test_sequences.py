@@ -1,0 +1,78 @@
+"""Cutting a rollout into pieces, padding them, and taking them apart again."""
+
+import pytest
+import torch
+
+from ppo_gru import Args, Memory, Pieces
+
+# Lane 0 ends an episode at step 2, lane 1 at steps 0 and 4 (the rollout's last).
+DONE = torch.tensor([[0, 1], [0, 0], [1, 0], [0, 0], [0, 1]], dtype=torch.bool)
+
+
+def pieces_of(memory, done):
+    pieces = memory.cut(done)
+    return list(zip(pieces.first.tolist(), pieces.length.tolist(), strict=True))
+
+
+def test_pieces_end_where_episodes_do():
+    memory = Memory(Args(hidden_size=4))
+    assert pieces_of(memory, DONE) == [(0, 3), (6, 2), (1, 1), (3, 4)]
+
+
+def test_pieces_end_after_seq_len_steps_counted_from_the_episode_s_first():
+    memory = Memory(Args(hidden_size=4, seq_len=2))
+    assert pieces_of(memory, DONE) == [(0, 2), (4, 1), (6, 2), (1, 1), (3, 2), (7, 2)]
+
+
+def test_without_memory_every_step_is_a_piece():
+    memory = Memory(Args(hidden_size=4, memory="none"))
+    assert pieces_of(memory, DONE) == [(t * 2 + n, 1) for n in (0, 1) for t in range(5)]
+
+
+def test_steps_are_the_pieces_steps_in_order():
+    steps = Pieces(torch.tensor([6, 1, 3]), torch.tensor([2, 1, 4]), lanes=2).steps()
+    assert steps.tolist() == [6, 8, 1, 3, 5, 7, 9]
+
+
+@pytest.mark.parametrize("seq_len", [0, 1, 7, 500])
+def test_minibatches_deal_every_step_once(seq_len):
+    torch.manual_seed(0)
+    done = torch.rand(64, 8) < 0.05
+    pieces = Memory(Args(hidden_size=4, seq_len=seq_len)).cut(done)
+    minibatches = list(pieces.minibatches(4))
+    steps = torch.cat([minibatch.steps() for minibatch in minibatches])
+    assert sorted(steps.tolist()) == list(range(64 * 8))
+    sizes = [int(minibatch.length.sum()) for minibatch in minibatches]
+    assert max(sizes) - min(sizes) <= 2 * pieces.length.max()
+    assert pieces.length.max() <= (seq_len or 64)
+    order = [minibatch.first.tolist() for minibatch in pieces.minibatches(4)]
+    assert order != [minibatch.first.tolist() for minibatch in minibatches], "the pieces are shuffled anew"
+
+
+def test_no_minibatch_is_empty_at_the_limit_of_check_args():
+    pieces = Memory(Args(hidden_size=4)).cut(torch.zeros(16, 8, dtype=torch.bool))
+    assert [len(minibatch.first) for minibatch in pieces.minibatches(8)] == [1] * 8
+
+
+def test_no_piece_spans_an_episode_s_end():
+    torch.manual_seed(1)
+    done = torch.rand(50, 6) < 0.1
+    pieces = Memory(Args(hidden_size=4, seq_len=9)).cut(done)
+    for first, length in zip(pieces.first.tolist(), pieces.length.tolist(), strict=True):
+        assert not done.flatten()[[first + i * 6 for i in range(length - 1)]].any()
+
+
+@pytest.mark.parametrize("seq_len", [0, 8])
+def test_padded_length_is_the_longest_piece(seq_len, monkeypatch):
+    memory = Memory(Args(hidden_size=4, seq_len=seq_len))
+    seen = []
+    run = memory.run
+    monkeypatch.setattr(memory, "run", lambda x, live: (seen.append(x.shape), run(x, live))[1])
+    done = torch.zeros(32, 3, dtype=torch.bool)
+    done[[4, 20]] = True
+    pieces = memory.cut(done)
+    y = memory.unroll(torch.randn(96, 4), pieces, torch.zeros(32, 3, 1, 4))
+    assert seen == [(len(pieces.length), seq_len or 16, 4)], "the recurrent layers run once, padded no further"
+    assert y.shape == (96, 4)
+    padding = 1 - 96 / (len(pieces.length) * (seq_len or 16))
+    assert memory.padding_fraction(pieces) == pytest.approx(padding)

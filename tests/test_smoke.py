@@ -1,0 +1,164 @@
+"""A short training of each kind, through `main` and through the command line."""
+
+import glob
+import math
+import os
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import ppo_gru
+
+SCRIPT = os.path.abspath(ppo_gru.__file__)
+CURVES = {
+    "charts/SPS", "charts/learning_rate", "charts/entropy_coefficient", "charts/padding_fraction",
+    "losses/policy_loss", "losses/value_loss", "losses/entropy", "losses/loss", "losses/approx_kl",
+    "losses/old_approx_kl", "losses/clipfrac", "losses/explained_variance", "losses/grad_norm", "losses/ratio_error",
+}  # fmt: skip
+EPISODES = {"charts/episodic_return", "charts/episodic_length"}
+
+
+class Image(gym.Env):
+    """Channels other than three, float pixels beside a vector, and a Discrete action space that starts at 1."""
+
+    observation_space = gym.spaces.Dict(
+        frame=gym.spaces.Box(0.0, 1.0, (40, 36, 2), np.float32), speed=gym.spaces.Box(-1.0, 1.0, (3,), np.float64)
+    )
+    action_space = gym.spaces.Discrete(3, start=1)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.observation_space.seed(int(self.np_random.integers(2**31)))
+        self.t = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        assert action in self.action_space
+        self.t += 1
+        return self.observation_space.sample(), float(action), False, self.t == 5, {}
+
+
+gym.register("Image-v0", entry_point=Image)
+
+
+@pytest.mark.parametrize("memory", ["gru", "lstm", "none"])
+@pytest.mark.parametrize("env_id", ["MortarMayhem-Grid-v0", "MortarMayhemB-v0", "CartPole-v1", "Image-v0"])
+def test_trains(tiny, scalars, env_id, memory):
+    curves = scalars(ppo_gru.main(tiny(env_id=env_id, memory=memory, num_steps=32, total_timesteps=256)))
+    assert curves.keys() >= CURVES
+    assert all(math.isfinite(value) for name in CURVES for value in curves[name])
+    assert all(error < 1e-5 for error in curves["losses/ratio_error"])
+    if env_id != "MortarMayhem-Grid-v0":
+        assert curves.keys() >= EPISODES
+
+
+def test_logs_every_number_of_the_final_info(tiny, scalars):
+    options = '{"command_count": [2], "explosion_delay": [3], "explosion_duration": [1]}'
+    curves = scalars(ppo_gru.main(tiny(env_id="MortarMayhemB-Grid-v0", env_options=options)))
+    numbers = {"episode/reward", "episode/length", "episode/success", "episode/commands_completed"}
+    assert {name for name in curves if name.startswith("episode/")} == numbers
+    assert curves["episode/reward"] == curves["charts/episodic_return"]
+    assert curves["episode/length"] == curves["charts/episodic_length"]
+    assert 4 <= min(curves["episode/length"]) <= max(curves["episode/length"]) <= 8, "the options are in force"
+
+
+def test_no_finished_episode_yet(tiny, scalars):
+    curves = scalars(ppo_gru.main(tiny(num_steps=8, total_timesteps=32)))
+    assert curves.keys() >= CURVES
+    assert not EPISODES & curves.keys()
+
+
+def test_episodes_are_counted_across_rollouts(played):
+    # Six episodes of 12 to 14 steps each in 5 x 16 steps; their lengths must not restart with the rollout.
+    *_, episodes = played(iterations=5, env_id="CueRecall-v0")
+    assert episodes["charts/episodic_length"]
+    assert all(12 <= length <= 14 for length in episodes["charts/episodic_length"])
+    assert episodes["charts/episodic_return"] == episodes["episode/right"]
+
+
+def test_same_seed_same_curves(tiny, scalars):
+    first, second, other = (
+        scalars(ppo_gru.main(tiny(env_id="MortarMayhemB-Grid-v0", exp_name=name, seed=seed)))
+        for name, seed in (("a", 1), ("b", 1), ("c", 2))
+    )
+    for name in first.keys() - {"charts/SPS"}:
+        np.testing.assert_array_equal(first[name], second[name], err_msg=name)
+    assert first["losses/policy_loss"] != other["losses/policy_loss"]
+
+
+def test_lanes_differ_and_neighbouring_seeds_share_none(tiny):
+    first = [ppo_gru.setup(tiny(env_id="MortarMayhem-v0", seed=seed, exp_name=str(seed))) for seed in (1, 2)]
+    frames = torch.cat([run.obs["observation"] for run in first]).flatten(1)
+    assert len(frames.unique(dim=0)) > 5  # of 8; some levels begin alike
+
+
+def test_annealing(tiny, scalars):
+    rates = {"init_lr": 1e-3, "final_lr": 1e-4, "init_ent_coef": 0.1, "final_ent_coef": 0.01}
+    down = scalars(ppo_gru.main(tiny(env_id="CueRecall-v0", total_timesteps=256, anneal_steps=128, **rates)))
+    assert down["charts/learning_rate"] == pytest.approx([1e-3, 5.5e-4, 1e-4, 1e-4])
+    assert down["charts/entropy_coefficient"] == pytest.approx([0.1, 0.055, 0.01, 0.01])
+    still = scalars(ppo_gru.main(tiny(env_id="CueRecall-v0", anneal_steps=0, exp_name="still", **rates)))
+    assert still["charts/learning_rate"] == pytest.approx([1e-3, 1e-3])
+
+
+def test_target_kl_ends_the_epochs(played, monkeypatch):
+    args, run, rollout, _, last_value, _ = played(env_id="CueRecall-v0", update_epochs=5, target_kl=1e-9)
+    steps = []
+    optimizer = torch.optim.SGD(run.agent.parameters(), lr=1.0)
+    monkeypatch.setattr(optimizer, "step", lambda step=optimizer.step: (steps.append(1), step()))
+    ppo_gru.update(run.agent, optimizer, rollout, last_value, 0.0, args)
+    assert len(steps) == args.num_minibatches
+
+
+def test_logged_divergences(played):
+    """KL and clip fraction are what their names say: log-ratios of 0.2 in one of two branches, on every step."""
+    args, run, rollout, _, _, _ = played(env_id="CueRecall-v0", clip_coef=0.1)
+    rollout.log_probs[..., 0] -= 0.2
+    pieces = run.agent.memory.cut(rollout.terminated)
+    _, logs = ppo_gru.minibatch_loss(run.agent, rollout, (rollout.rewards, rollout.rewards), pieces, 0.0, args)
+    assert logs["losses/old_approx_kl"].item() == pytest.approx(-0.2, abs=1e-5)
+    assert logs["losses/approx_kl"].item() == pytest.approx(math.exp(0.2) - 1 - 0.2, abs=1e-5)
+    assert logs["losses/clipfrac"].item() == 0.5
+    assert logs["losses/ratio_error"].item() == pytest.approx(math.exp(0.2) - 1, abs=1e-5)
+
+
+def test_save_and_load(tiny):
+    folder = ppo_gru.main(tiny(env_id="CueRecall-v0", save_model=True, memory="lstm"))
+    path = os.path.join(folder, "model.pt")
+    args, weights = ppo_gru.load_model(path)
+    assert args == tiny(env_id="CueRecall-v0", save_model=True, memory="lstm")
+    assert all(weight.device.type == "cpu" for weight in weights.values())
+    run = ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path, memory="lstm", exp_name="again", seed=9))
+    for name, weight in run.agent.state_dict().items():
+        assert weight.equal(weights[name])
+    assert [name for name in os.listdir(folder) if name.startswith("model")] == ["model.pt"]
+
+
+def test_capture_video(tiny):
+    pytest.importorskip("moviepy")
+    folder = ppo_gru.main(tiny(env_id="MortarMayhemB-Grid-v0", capture_video=True))
+    videos = glob.glob(os.path.join(folder, "videos", "*.mp4"))
+    assert {os.path.basename(video) for video in videos} == {"episode-0.mp4", "episode-1.mp4"}
+    assert all(os.path.getsize(video) > 1000 for video in videos)
+
+
+def test_command_line(tmp_path):
+    flags = "--env-id MortarMayhem-Grid-v0 --total-timesteps 64 --num-envs 2 --num-steps 16 --num-minibatches 2"
+    command = [sys.executable, SCRIPT, *flags.split(), "--hidden-size", "16", "--no-cuda", "--save-model"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "SPS" in done.stderr
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert folder.name.startswith("MortarMayhem-Grid-v0__ppo_gru__1__")
+    assert (folder / "model.pt").exists()
+
+
+def test_help():
+    shown = subprocess.run([sys.executable, SCRIPT, "--help"], capture_output=True, text=True, timeout=300)
+    assert shown.returncode == 0
+    for name in ppo_gru.Args.__dataclass_fields__:
+        assert f"{ppo_gru.flag(name)}" in shown.stdout
