@@ -183,6 +183,18 @@ def test_levels(env_id):
         assert infos["ground_truth"].shape == (2, 2)
 
 
+def test_unseeded_levels_differ():
+    """Without a seed every lane of every environment takes its own entropy."""
+    played = set()
+    for _ in range(2):
+        envs = gym.make_vec("MortarMayhem-v0", num_envs=3, num_levels=10**9)
+        envs.reset()
+        played.update(envs.np_random_seed)
+    unlimited = gym.make_vec("MortarMayhem-v0", num_envs=3)
+    unlimited.reset()
+    assert len(played | set(unlimited.np_random_seed)) == 9
+
+
 # ---- options ----
 
 

@@ -73,6 +73,21 @@ def test_failure_pays_only_the_failure_reward(env_id):
 
 
 @pytest.mark.parametrize("env_id", BOUNDS)
+def test_failing_at_the_last_command(env_id):
+    """It counts as success, as in the original, but the episode's reward is overwritten by the failure's."""
+    env = gym.make(env_id).unwrapped
+    idle = np.zeros(env.action_space.shape, np.int64)
+    options = {"command_count": [1], "reward_command_failure": -0.5, "reward_episode_success": 3.0}
+    earned = set()
+    for seed in range(20):
+        rewards, _, _, info = play_out(env, lambda: idle, seed, options)
+        assert (info["success"], info["commands_completed"]) == (1, 1.0)
+        assert not any(rewards[:-1])
+        earned.add(rewards[-1])
+    assert earned == {-0.5, 3.1}  # 3.1 where the command was to stay
+
+
+@pytest.mark.parametrize("env_id", BOUNDS)
 def test_walking_into_the_fire(env_id):
     """The command that was already checked no longer counts, and the step pays the failure reward."""
     env = gym.make(env_id).unwrapped
