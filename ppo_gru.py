@@ -16,6 +16,7 @@ Shape letters: T steps of a rollout, N lanes (environments in parallel), A actio
 S pieces of a minibatch, L steps of the longest piece, D width of the memory, P hidden vectors per lane.
 """
 
+import contextlib
 import importlib
 import json
 import math
@@ -126,6 +127,11 @@ class Args:
     """longest piece the gradient flows through (0: the longest episode in the rollout)"""
 
 
+def flag(name: str) -> str:
+    """Return the command line's spelling of a field of Args."""
+    return "--" + name.replace("_", "-")
+
+
 def check_args(args: Args) -> None:
     """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work."""
     integers = [("num_levels", 0), ("start_level", 0), ("anneal_steps", 0), ("seq_len", 0), ("seed", 0)]
@@ -158,11 +164,6 @@ def check_args(args: Args) -> None:
 
 
 # ---- 2 ENVIRONMENTS ----
-def flag(name: str) -> str:
-    """Return the command line's spelling of a field of Args."""
-    return "--" + name.replace("_", "-")
-
-
 def make_envs(env_id: str, num_envs: int, num_levels: int, start_level: int, video: bool) -> gym.vector.VectorEnv:
     """Make a vector environment with same-step autoreset: an ended lane's next observation begins a new episode.
 
@@ -277,9 +278,6 @@ def layer_init(layer: nn.Module, gain: float = math.sqrt(2)) -> nn.Module:
     """Initialize a layer's weights orthogonally and its biases with zero; return it."""
     for name, parameter in layer.named_parameters():
         nn.init.zeros_(parameter) if "bias" in name else nn.init.orthogonal_(parameter, gain)
-    if isinstance(layer, nn.Linear):
-        # Kept transposed in memory: a CPU multiplies a rollout's few rows by it two to three times as fast.
-        layer.weight.data = layer.weight.data.t().contiguous().t()
     return layer
 
 
@@ -375,7 +373,6 @@ class AtariCNN(nn.Sequential):
             nn.ReLU(inplace=True),
             layer_init(nn.Conv2d(64, 64, 3, 1)),
             nn.ReLU(inplace=True),
-            nn.Flatten(),
         )
         self.chunk = chunk
         self.to(memory_format=torch.channels_last)  # the order in which the environments deliver pixels
@@ -385,7 +382,8 @@ class AtariCNN(nn.Sequential):
         # A CPU's caches want small batches: the backward pass of 2,048 frames at once takes about 1.5 times as long.
         chunks = pixels.split(self.chunk) if pixels.device.type == "cpu" else [pixels]
         features = [super(AtariCNN, self).forward(self.scale(chunk)) for chunk in chunks]
-        return torch.cat(features) if len(features) > 1 else features[0]
+        features = torch.cat(features) if len(features) > 1 else features[0]  # (B, channels, height, width)
+        return features.permute(0, 2, 3, 1).flatten(1)  # in the order they have in memory: no copy
 
     @staticmethod
     def scale(pixels: Tensor) -> Tensor:
@@ -555,10 +553,9 @@ def load_weights(agent: Agent, path: str) -> None:
     try:
         agent.load_state_dict(weights)
     except RuntimeError:
-        raise ValueError(
-            f"{path} holds another network (trained with --env-id {saved_args.env_id} --memory {saved_args.memory} "
-            f"--hidden-size {saved_args.hidden_size} --num-layers {saved_args.num_layers}); train with these flags"
-        ) from None
+        usual = asdict(Args())
+        flags = [f"{flag(name)} {value}" for name, value in asdict(saved_args).items() if value != usual[name]]
+        raise ValueError(f"{path} holds another network; it was trained with {' '.join(flags)}") from None
 
 
 # ---- 7 TRAINING ----
@@ -620,6 +617,7 @@ def collect(
     number in the environment's final info. Leaves `play` where the next rollout goes on.
     """
     device, episodes = rollout.values.device, defaultdict(list)
+    rollout.truncation_values.zero_()
     for t in range(args.num_steps):
         for name, part in play.obs.items():
             rollout.obs[name][t] = part  # the first and only copy: env to device, dtype kept
@@ -636,7 +634,8 @@ def collect(
         rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
         if args.bootstrap_truncated and truncated.any():
             final = on_device(final_observations(play.obs, infos, truncated), device)
-            rollout.truncation_values[t] = agent.act(final, live)[1]  # the memory as it was before the reset
+            value = agent.act(final, live)[1]  # from the memory as it was before the reset
+            rollout.truncation_values[t] = value * rollout.truncated[t]
 
         done = terminated | truncated
         play.live = agent.memory.reset(live, torch.as_tensor(done, device=device))
@@ -688,7 +687,7 @@ def minibatch_loss(
     steps = pieces.steps().to(rollout.values.device)  # (R,)
 
     def take(stored: Tensor) -> Tensor:
-        return stored.flatten(0, 1)[steps]
+        return stored.flatten(0, 1).index_select(0, steps)
 
     policy, values = agent.evaluate({k: take(v) for k, v in rollout.obs.items()}, pieces, rollout.memory)
     log_ratio = log_probs_of(policy, take(rollout.actions)) - take(rollout.log_probs)  # (R, A)
@@ -821,7 +820,8 @@ def train(args: Args, run: Run) -> str:
     recent = {"return": deque(maxlen=100), "length": deque(maxlen=100)}
     batch_size = args.num_envs * args.num_steps
     start = time.perf_counter()
-    with tqdm(total=args.total_timesteps // batch_size * batch_size, unit=" steps", unit_scale=True) as bar:
+    bar = tqdm(total=args.total_timesteps // batch_size * batch_size, unit=" steps", unit_scale=True)
+    with bar, contextlib.suppress(KeyboardInterrupt):  # Ctrl-C ends the training early and keeps what was learned
         for step in range(0, bar.total, batch_size):
             schedule = {
                 "charts/learning_rate": anneal(step, args.init_lr, args.final_lr, args.anneal_steps),

@@ -1,19 +1,18 @@
-"""How fast the scripts train, beside the bound that the convolutions alone would allow.
+"""How fast the scripts train, beside the bounds that the encoder alone would allow.
 
     python benchmarks/train_sps.py --num-steps 128 512
 
-The bound of an iteration is the Atari CNN and nothing else: forward on every step of the rollout, then forward and
-backward on every step of every epoch, in pieces of the best size. A script's iteration is all it does: environments,
-memory, heads, losses and optimizer. Both are timed in turn, several times, and the medians divided, because a
-machine's speed changes from minute to minute.
+A bound of an iteration is a part of the encoder and nothing else: forward on every step of the rollout, then forward
+and backward on every step of every epoch, in pieces of the best size. One bound is the three convolutions, the other
+these and the layer from their 3,136 features to the memory's width. A script's iteration is all it does: environments,
+memory, heads, losses and optimizer. All are timed in turn, several times, and the medians divided, because a machine's
+speed changes from minute to minute.
 """
 
-import contextlib
 import importlib
-import io
 import os
 import statistics
-import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -21,8 +20,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 import tyro
-
-sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), ".."))
 
 
 @dataclass
@@ -68,51 +65,60 @@ def script_iteration(script, args, run) -> Callable[[], None]:
     return iteration
 
 
-def bound_iteration(script, args, device: torch.device, chunk: int) -> Callable[[], None]:
-    """Return a function that does the convolutions of one iteration and nothing else, in pieces of chunk frames."""
-    cnn = script.AtariCNN(3, chunk).to(device)
+def bound_iteration(network: torch.nn.Module, args, device: torch.device, chunk: int) -> Callable[[], None]:
+    """Return a function that does the network's work of one iteration and nothing else, in pieces of chunk frames."""
+    network = network.to(device)
     frames = torch.randint(0, 256, (max(chunk, args.num_envs), 84, 84, 3), dtype=torch.uint8, device=device)
 
     def iteration() -> None:
         with torch.no_grad():
             for _ in range(args.num_steps):
-                cnn(frames[: args.num_envs])
+                network(frames[: args.num_envs])
         for _ in range(args.update_epochs * args.num_envs * args.num_steps // chunk):
-            cnn(frames[:chunk]).sum().backward()
+            network(frames[:chunk]).sum().backward()
 
     return iteration
 
 
-def measure(config: Config, num_steps: int) -> tuple[float, float, int]:
-    """Return the steps per second of script and bound, and the bound's best piece size."""
+def measure(config: Config, num_steps: int) -> tuple[dict[str, float], int]:
+    """Return the steps per second of the script and of both bounds, and the bounds' best piece size."""
     script = importlib.import_module(config.script)
-    flags = ["--env-id", config.env_id, "--num-envs", str(config.num_envs), "--num-steps", str(num_steps)]
-    args = tyro.cli(script.Args, args=[*flags, *config.flags])
-    with contextlib.redirect_stderr(io.StringIO()):
-        run = script.setup(args)
-    short = tyro.cli(script.Args, args=[*flags[:-1], "32", *config.flags])
-    trial = {c: bound_iteration(script, short, run.device, c) for c in config.chunks}
-    best = min(config.chunks, key=lambda chunk: min(seconds(trial[chunk], run.device) for _ in range(3)))
-    work = {"script": script_iteration(script, args, run), "bound": bound_iteration(script, args, run.device, best)}
+    flags = ["--env-id", config.env_id, "--num-envs", str(config.num_envs), "--num-steps"]
+    args = tyro.cli(script.Args, args=[*flags, str(num_steps), *config.flags])
+    short = tyro.cli(script.Args, args=[*flags, "32", *config.flags])
+    run = script.setup(args)
+    cnn = script.AtariCNN(3, max(config.chunks))
+    encoder = torch.nn.Sequential(cnn, torch.nn.Linear(3136, run.agent.memory.width), torch.nn.ReLU())
+    trials = {chunk: bound_iteration(cnn, short, run.device, chunk) for chunk in config.chunks}
+    best = min(trials, key=lambda chunk: min(seconds(trials[chunk], run.device) for _ in range(3)))
+    work = {
+        "script": script_iteration(script, args, run),
+        "convolutions": bound_iteration(cnn, args, run.device, best),
+        "encoder": bound_iteration(encoder, args, run.device, best),
+    }
     work["script"]()  # the first iteration allocates
     times = {name: [] for name in work}
     for _ in range(config.rounds):
         for name, iteration in work.items():
             times[name].append(seconds(iteration, run.device))
     run.envs.close()
-    steps = config.num_envs * num_steps
-    return steps / statistics.median(times["script"]), steps / statistics.median(times["bound"]), best
+    return {name: config.num_envs * num_steps / statistics.median(taken) for name, taken in times.items()}, best
 
 
 def main(config: Config) -> None:
     """Print a Markdown table, a row per rollout length."""
     print(f"{config.script} on {config.env_id} {' '.join(config.flags)}, {torch.get_num_threads()} threads\n")
-    print("| lanes x steps | steps/s | bound, steps/s | share of the bound | bound's piece |")
-    print("|---|---|---|---|---|")
-    for num_steps in config.num_steps:
-        speed, bound, chunk = measure(config, num_steps)
-        size = f"{config.num_envs} x {num_steps}"
-        print(f"| {size} | {speed:.0f} | {bound:.0f} | {speed / bound:.2f} | {chunk} |", flush=True)
+    print("| lanes x steps | steps/s | convolutions alone | share | encoder alone | share | best piece |")
+    print("|---|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)  # the run folders go there
+        for num_steps in config.num_steps:
+            rates, chunk = measure(config, num_steps)
+            bounds = [
+                f"{rates[name]:.0f} | {rates['script'] / rates[name]:.2f}" for name in ("convolutions", "encoder")
+            ]
+            row = [f"{config.num_envs} x {num_steps}", f"{rates['script']:.0f}", *bounds, str(chunk)]
+            print(f"| {' | '.join(row)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -78,7 +78,7 @@ def test_a_run_folder_that_cannot_be_written(tmp_path, tiny):
 def test_a_model_of_another_network(tiny):
     folder = ppo_gru.main(tiny(env_id="CueRecall-v0", save_model=True))
     path = os.path.join(folder, "model.pt")
-    with pytest.raises(ValueError, match=r"another network .*--memory gru --hidden-size 32"):
+    with pytest.raises(ValueError, match=r"another network; .* --env-id CueRecall-v0 .*--hidden-size 32"):
         ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path, hidden_size=64))
     torch.save({"weights": 1}, path)
     with pytest.raises(ValueError, match="is not a model"):

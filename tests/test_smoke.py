@@ -96,6 +96,23 @@ def test_lanes_differ_and_neighbouring_seeds_share_none(tiny):
     assert len(frames.unique(dim=0)) > 5  # of 8; some levels begin alike
 
 
+def test_trains_on_the_levels_asked_for_from_the_first_episode_on(played):
+    _, run, rollout, *_ = played(env_id="MortarMayhemB-Grid-v0", num_levels=3, start_level=10, num_steps=1)
+    seen = set(run.envs.np_random_seed)
+    _, run, rollout, *_ = played(env_id="MortarMayhemB-Grid-v0", num_levels=3, start_level=10, exp_name="later")
+    assert rollout.terminated.any()
+    assert seen | set(run.envs.np_random_seed) <= {10, 11, 12}
+
+
+def test_interrupting_keeps_what_was_learned(tiny, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ppo_gru, "collect", interrupted)
+    folder = ppo_gru.main(tiny(env_id="CueRecall-v0", save_model=True))
+    assert os.path.exists(os.path.join(folder, "model.pt"))
+
+
 def test_annealing(tiny, scalars):
     rates = {"init_lr": 1e-3, "final_lr": 1e-4, "init_ent_coef": 0.1, "final_ent_coef": 0.01}
     down = scalars(ppo_gru.main(tiny(env_id="CueRecall-v0", total_timesteps=256, anneal_steps=128, **rates)))

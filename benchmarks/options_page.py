@@ -1,0 +1,24 @@
+"""Print docs/options.md, the reset options of every environment, from the tables that the environments check against.
+
+python benchmarks/options_page.py > docs/options.md
+"""
+
+from memory_gym_envs import FAMILIES, options_table
+
+HEAD = """# Reset options
+
+What `reset(options={...})` takes, by environment. Options hold until the next explicit reset; automatic resets keep
+them. Of a list, marked *, one entry is drawn at every reset. Made by `python benchmarks/options_page.py`.
+"""
+
+
+def page() -> str:
+    """Return the page as Markdown."""
+    tables = [
+        f"## {id_}\n\n{options_table(row.options)}" for family in FAMILIES for id_, row in family.variants.items()
+    ]
+    return "\n".join([HEAD, "\n\n".join(tables)]) + "\n"
+
+
+if __name__ == "__main__":
+    print(page(), end="")
