@@ -18,6 +18,7 @@ S pieces of a minibatch, L steps of the longest piece, D width of the memory, P 
 
 import contextlib
 import importlib
+import itertools
 import json
 import math
 import os
@@ -33,6 +34,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 import tyro
+from gymnasium.utils.save_video import capped_cubic_video_schedule
 from gymnasium.vector import AutoresetMode
 from torch import Tensor, nn
 from torch.distributions import Categorical
@@ -79,7 +81,7 @@ class Args:
     """the first of these levels"""
 
     total_timesteps: int = 163_840_000
-    """steps to train for, all lanes together"""
+    """steps to train for, all lanes together, rounded down to whole iterations of num_envs x num_steps"""
     num_envs: int = 32
     """lanes: environments that play in parallel"""
     num_steps: int = 512
@@ -140,8 +142,8 @@ def check_args(args: Args) -> None:
     numbers = [("gamma", 0, 1), ("gae_lambda", 0, 1)]
     numbers += [(name, 0, math.inf) for name in ("vf_coef", "init_lr", "final_lr", "init_ent_coef", "final_ent_coef")]
     for name, low in integers:
-        if getattr(args, name) < low:
-            raise ValueError(f"{flag(name)} is {getattr(args, name)}; it must be {low} or more")
+        if not low <= getattr(args, name) < 2**63:
+            raise ValueError(f"{flag(name)} is {getattr(args, name)}; it must be {low} or more (and below 2 ** 63)")
     for name, low, high in numbers:
         if not low <= getattr(args, name) <= high or not math.isfinite(getattr(args, name)):
             raise ValueError(f"{flag(name)} is {getattr(args, name)}; it must be a number from {low} to {high}")
@@ -149,17 +151,19 @@ def check_args(args: Args) -> None:
         value = getattr(args, name)
         if value is not None and not value > 0:
             raise ValueError(f"{flag(name)} is {value}; it must be above 0")
+    if not args.exp_name or set(args.exp_name) & set("/\\"):
+        raise ValueError(f"--exp-name is {args.exp_name!r}; it must be a name without slashes")
     batch_size = args.num_envs * args.num_steps
     if args.total_timesteps < batch_size:
         raise ValueError(
             f"--total-timesteps is {args.total_timesteps}, less than one iteration of {batch_size} steps "
             f"(--num-envs {args.num_envs} x --num-steps {args.num_steps})"
         )
-    longest = min(args.seq_len or args.num_steps, args.num_steps)
+    longest = 1 if args.memory == "none" else min(args.seq_len or args.num_steps, args.num_steps)
     if args.num_minibatches * longest > batch_size:
         raise ValueError(
             f"--num-minibatches is {args.num_minibatches}, but an iteration is sure of only {batch_size // longest} "
-            f"sequences (up to {longest} of {batch_size} steps each); use fewer minibatches or a shorter --seq-len"
+            f"pieces to deal (up to {longest} of {batch_size} steps each); use that many or a shorter --seq-len"
         )
 
 
@@ -167,24 +171,27 @@ def check_args(args: Args) -> None:
 def make_envs(env_id: str, num_envs: int, num_levels: int, start_level: int, video: bool) -> gym.vector.VectorEnv:
     """Make a vector environment with same-step autoreset: an ended lane's next observation begins a new episode.
 
-    Uses the id's own vector entry point where that resets in the same step, else Gymnasium's synchronous one.
-    Raises gymnasium.error.Error for an unknown id, ImportError for a missing package or module.
+    Uses the id's own vector entry point where that resets in the same step, else Gymnasium's synchronous one. With
+    video, render() returns a picture a lane. Raises gymnasium.error.Error for an unknown id, ImportError for a missing
+    package or module, ValueError for wrong levels.
     """
     module, _, name = env_id.rpartition(":")
     if module:
         importlib.import_module(module)
-    spec = gym.spec(name)
     levels = is_memory_gym(name)
     kwargs = {"num_levels": num_levels, "start_level": start_level} if levels else {}
     if video:
         kwargs["render_mode"] = "debug_rgb_array" if levels else "rgb_array"
-    if spec.vector_entry_point is not None:
-        envs = gym.make_vec(name, num_envs, **kwargs)
-        if envs.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:
-            return envs
-        envs.close()
     same_step = {"autoreset_mode": AutoresetMode.SAME_STEP}
-    return gym.make_vec(name, num_envs, vectorization_mode="sync", vector_kwargs=same_step, **kwargs)
+    try:
+        if gym.spec(name).vector_entry_point is not None:
+            envs = gym.make_vec(name, num_envs, **kwargs)
+            if envs.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:
+                return envs
+            envs.close()
+        return gym.make_vec(name, num_envs, vectorization_mode="sync", vector_kwargs=same_step, **kwargs)
+    except TypeError as error:  # what a constructor says of an argument that it does not take
+        raise ValueError(f"{env_id} cannot be made: {error}") from None
 
 
 def is_memory_gym(env_id: str) -> bool:
@@ -206,7 +213,10 @@ def reset_options(env_id: str, env_options: str) -> dict | None:
 
 
 def first_reset(envs: gym.vector.VectorEnv, seed: int, options: dict | None) -> dict[str, Tensor]:
-    """Seed every lane with its own stream, then begin each lane's first episode; return its observations (N, ...)."""
+    """Seed every lane with its own stream, then begin each lane's first episode; return its observations (N, ...).
+
+    Raises ValueError for a reset parameter that the environment does not have or allow.
+    """
     # Neighbouring run seeds must not share lanes, so the lanes' seeds count up from a hash of the run's seed.
     envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]), options=options)
     # An explicit seed is a level of its own; from here on the levels come from the training set.
@@ -244,31 +254,43 @@ def to_env_actions(actions: Tensor, space: gym.Space) -> np.ndarray:
 
 
 def as_tensors(obs: np.ndarray | dict[str, np.ndarray]) -> dict[str, Tensor]:
-    """Give observations their names of `observation_spaces`, as tensors that share memory with the arrays."""
-    return {k: torch.from_numpy(v) for k, v in (obs if isinstance(obs, dict) else {"observation": obs}).items()}
+    """Give observations their names of `observation_spaces`, as tensors on the CPU."""
+    parts = obs if isinstance(obs, dict) else {"observation": obs}
+    return {name: torch.from_numpy(np.ascontiguousarray(part)) for name, part in parts.items()}
+
+
+def require(module: str, name: str, extra: str):
+    """Import a module that only the flag `name` needs; raise ImportError that says which extra brings it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise ImportError(f'{name} needs {module.split(".")[0]}: pip install -e ".[{extra}]"') from None
 
 
 class LaneRecorder:
-    """Writes videos of lane 0, of the episodes that Gymnasium's capped cubic schedule picks (0, 1, 8, 27, ...)."""
+    """Writes videos of lane 0, of the episodes that Gymnasium's capped cubic schedule picks (0, 1, 8, 27, ...).
+
+    A video shows every observation that was acted on, up to max_frames. Raises ImportError without the extra `play`,
+    ValueError if the environment draws no pictures.
+    """
 
     def __init__(self, envs: gym.vector.VectorEnv, folder: str, max_frames: int = 1000):
         self.envs, self.folder, self.max_frames = envs, folder, max_frames
         self.episode, self.frames = 0, []
+        self.write = require("moviepy.video.io.ImageSequenceClip", "--capture-video", "play").ImageSequenceClip
+        if not isinstance((envs.render() or [None])[0], np.ndarray):
+            raise ValueError("--capture-video needs an environment that draws pictures (render_mode rgb_array)")
 
     def capture(self) -> None:
         """Keep a frame of the episode that is being played, if it is one to record."""
-        from gymnasium.utils.save_video import capped_cubic_video_schedule
-
         if capped_cubic_video_schedule(self.episode) and len(self.frames) < self.max_frames:
             self.frames.append(self.envs.render()[0])
 
     def end_episode(self) -> None:
         """Write the episode's frames to episode-<number>.mp4 and go on to the next episode."""
         if self.frames:
-            from moviepy.video.io.ImageSequenceClip import ImageSequenceClip
-
             os.makedirs(self.folder, exist_ok=True)
-            clip = ImageSequenceClip(self.frames, fps=self.envs.metadata.get("render_fps", 30))
+            clip = self.write(self.frames, fps=self.envs.metadata.get("render_fps", 30))
             clip.write_videofile(os.path.join(self.folder, f"episode-{self.episode}.mp4"), logger=None)
         self.episode, self.frames = self.episode + 1, []
 
@@ -356,9 +378,9 @@ class Pieces:
         """Shuffle the pieces and deal them, whole, into count minibatches of nearly the same number of steps."""
         order = torch.randperm(len(self.first))
         first, length = self.first[order], self.length[order]
-        minibatch = (length.cumsum(0) - length) * count // length.sum()
+        share = (length.cumsum(0) - length) * count // length.sum()  # (S,) the minibatch that a piece goes to
         for i in range(count):
-            yield Pieces(first[minibatch == i], length[minibatch == i], self.lanes)
+            yield Pieces(first[share == i], length[share == i], self.lanes)
 
 
 # ---- 4 ENCODERS AND HEADS ----
@@ -412,7 +434,7 @@ class Encoder(nn.Module):
         """Encode observations of B steps, each part (B, ...), to (B, D)."""
         features = [cnn(obs[name]) for cnn, name in zip(self.cnns, self.pixels, strict=True)]
         if self.vectors:
-            features.append(F.relu(self.mlp(torch.cat([obs[name] for name in self.vectors], -1))))
+            features.append(F.relu(self.mlp(torch.cat([obs[name].float() for name in self.vectors], -1))))
         features = torch.cat(features, -1) if len(features) > 1 else features[0]
         return F.relu(self.embedding(features))
 
@@ -446,6 +468,8 @@ class Memory(nn.Module):
     for the LSTM, none without memory. A rollout stores, of every step, the live memory that the step began with.
     """
 
+    flags = ("memory", "hidden_size", "num_layers")  # those that shape the network
+
     def __init__(self, args: Args):
         super().__init__()
         self.seq_len, self.width = args.seq_len, args.hidden_size
@@ -460,9 +484,13 @@ class Memory(nn.Module):
         """Return the live memory (N, P, D) of fresh episodes."""
         return torch.zeros(lanes, self.hidden_vectors, self.width, device=device)
 
+    def storage(self, num_steps: int, lanes: int, device: torch.device) -> Tensor:
+        """Return room (T, N, P, D) for what a rollout stores."""
+        return torch.zeros(num_steps, lanes, self.hidden_vectors, self.width, device=device)
+
     def step(self, x: Tensor, live: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Take one step of all lanes: x (N, D) to (N, D), the new live memory, and what to store of this step."""
-        y, new_live = self.run(x[:, None], live)
+        y, new_live = self.recur(x[:, None], live)
         return y[:, 0], new_live, live
 
     def reset(self, live: Tensor, done: Tensor) -> Tensor:
@@ -485,12 +513,12 @@ class Memory(nn.Module):
         """Run whole pieces at once: x (R, D) to (R, D), from the stored (T, N, P, D) memory of their first steps."""
         live = stored.flatten(0, 1)[pieces.first.to(x.device)]  # (S, P, D)
         padded = pad_sequence(x.split(pieces.length.tolist()), batch_first=True)  # (S, L, D)
-        y, _ = self.run(padded, live)
+        y, _ = self.recur(padded, live)
         # The padding ends here: what follows, the losses' means (5.8) included, sees real steps only.
         real = torch.arange(padded.shape[1]) < pieces.length[:, None]  # (S, L)
         return y[real.to(x.device)]
 
-    def run(self, x: Tensor, live: Tensor) -> tuple[Tensor, Tensor]:
+    def recur(self, x: Tensor, live: Tensor) -> tuple[Tensor, Tensor]:
         """Run the recurrent layers over x (S, L, D) from the live memory (S, P, D); return both anew."""
         if self.kind == "none":
             return x, live
@@ -509,7 +537,10 @@ class Memory(nn.Module):
 
 # ---- 6 AGENT ----
 class Agent(nn.Module):
-    """Encoder, memory and heads. Plays step by step with `act`, learns from whole pieces with `evaluate`."""
+    """Encoder, memory and heads. Plays step by step with `act`, learns from whole pieces with `evaluate`.
+
+    Raises ValueError for spaces that it cannot encode or act in.
+    """
 
     def __init__(self, observation_space: gym.Space, action_space: gym.Space, args: Args):
         super().__init__()
@@ -519,8 +550,8 @@ class Agent(nn.Module):
 
     def act(self, obs: dict[str, Tensor], live: Tensor) -> tuple[list[Categorical], Tensor, Tensor, Tensor]:
         """Take one step of all lanes: the action distributions, values (N,), new live memory, and what to store."""
-        x, live, item = self.memory.step(self.encoder(obs), live)
-        return *self.heads(x), live, item
+        x, live, stored = self.memory.step(self.encoder(obs), live)
+        return *self.heads(x), live, stored
 
     def evaluate(self, obs: dict[str, Tensor], pieces: Pieces, stored: Tensor) -> tuple[list[Categorical], Tensor]:
         """Recompute the action distributions and values (R,) of the steps of the pieces, in the pieces' order."""
@@ -538,6 +569,8 @@ def load_model(path: str) -> tuple[Args, dict[str, Tensor]]:
 
     Raises ValueError if the file is not such a file, OSError if it cannot be read.
     """
+    if not os.path.isfile(path):
+        raise OSError(f"there is no file {path}; --save-model writes model.pt to the run folder")
     with open(path, "rb") as file:
         try:
             saved = torch.load(file, map_location="cpu", weights_only=True)
@@ -548,14 +581,16 @@ def load_model(path: str) -> tuple[Args, dict[str, Tensor]]:
 
 
 def load_weights(agent: Agent, path: str) -> None:
-    """Give the agent the weights in the file; raise ValueError if they belong to another network."""
+    """Give the agent the weights in the file.
+
+    Raises ValueError if they belong to another network or the file holds none, OSError if it cannot be read.
+    """
     saved_args, weights = load_model(path)
     try:
         agent.load_state_dict(weights)
-    except RuntimeError:
-        usual = asdict(Args())
-        flags = [f"{flag(name)} {value}" for name, value in asdict(saved_args).items() if value != usual[name]]
-        raise ValueError(f"{path} holds another network; it was trained with {' '.join(flags)}") from None
+    except (RuntimeError, TypeError):
+        flags = [f"{flag(name)} {getattr(saved_args, name)}" for name in ("env_id", *agent.memory.flags)]
+        raise ValueError(f"{path} holds the weights of another network, trained with {' '.join(flags)}") from None
 
 
 # ---- 7 TRAINING ----
@@ -581,11 +616,9 @@ def make_rollout(agent: Agent, obs: dict[str, Tensor], num_steps: int, device: t
     def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.zeros(num_steps, lanes, *shape, dtype=dtype, device=device)
 
-    stored = {name: empty(*part.shape[1:], dtype=part.dtype) for name, part in on_device(obs, device).items()}
-    item = agent.memory.initial(lanes, device)
     branches = len(agent.heads.branches)
     return Rollout(
-        obs=stored,
+        obs={name: empty(*part.shape[1:], dtype=part.dtype) for name, part in on_device(obs, device).items()},
         actions=empty(branches, dtype=torch.int64),
         log_probs=empty(branches),
         values=empty(),
@@ -593,7 +626,7 @@ def make_rollout(agent: Agent, obs: dict[str, Tensor], num_steps: int, device: t
         terminated=empty(dtype=torch.bool),
         truncated=empty(dtype=torch.bool),
         truncation_values=empty(),
-        memory=empty(*item.shape[1:]),
+        memory=agent.memory.storage(num_steps, lanes, device),
     )
 
 
@@ -674,10 +707,12 @@ def note_episodes(play: Play, rewards: np.ndarray, done: np.ndarray, infos: dict
     episodes["charts/episodic_return"] += play.returns[done].tolist()
     episodes["charts/episodic_length"] += play.lengths[done].tolist()
     play.returns[done], play.lengths[done] = 0, 0
-    for name, values in infos.get("final_info", {}).items():
-        is_number = isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "biuf"
-        if is_number and not name.startswith("_"):
-            episodes[f"episode/{name}"] += values[done & infos["final_info"][f"_{name}"]].tolist()
+    final = infos.get("final_info", {})
+    for name, values in final.items():
+        if f"_{name}" in final and isinstance(values, np.ndarray):
+            ended = np.array(values[done & final[f"_{name}"]].tolist())
+            if ended.ndim == 1 and ended.dtype.kind in "biuf":
+                episodes[f"episode/{name}"] += ended.tolist()
 
 
 def minibatch_loss(
@@ -718,8 +753,14 @@ def update(
 ) -> dict[str, float]:
     """Learn from the rollout for some epochs; return what to log, averaged over the minibatches."""
     advantages = gae(
-        *(rollout.rewards, rollout.values, last_value, rollout.terminated, rollout.truncated),
-        *(rollout.truncation_values, args.gamma, args.gae_lambda),
+        rewards=rollout.rewards,
+        values=rollout.values,
+        last_value=last_value,
+        terminated=rollout.terminated,
+        truncated=rollout.truncated,
+        truncation_values=rollout.truncation_values,
+        gamma=args.gamma,
+        gae_lambda=args.gae_lambda,
     )
     returns = advantages + rollout.values
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
@@ -756,8 +797,10 @@ class Run:
 
     envs: gym.vector.VectorEnv
     agent: Agent
-    obs: dict[str, Tensor]  # (N, ...) the first observations
-    device: torch.device
+    optimizer: torch.optim.Optimizer
+    rollout: Rollout
+    play: Play
+    recorder: LaneRecorder | None
     folder: str
     writer: SummaryWriter
 
@@ -771,84 +814,102 @@ def setup(args: Args) -> Run:
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
     device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
-    if args.capture_video:
-        importlib.import_module("moviepy")
-    if args.track:
-        importlib.import_module("wandb")
-
+    options = reset_options(args.env_id, args.env_options)
     envs = make_envs(args.env_id, args.num_envs, args.num_levels, args.start_level, args.capture_video)
     if envs.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
         raise ValueError(f"{args.env_id} does not reset an ended episode in the same step")
+    obs = first_reset(envs, args.seed, options)
     agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(device)
     if args.load_model is not None:
         load_weights(agent, args.load_model)
-    obs = first_reset(envs, args.seed, reset_options(args.env_id, args.env_options))
+    optimizer = torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)
+    try:
+        rollout = make_rollout(agent, obs, args.num_steps, device)
+    except (MemoryError, RuntimeError):
+        size = f"--num-envs {args.num_envs} x --num-steps {args.num_steps}"
+        raise ValueError(f"a rollout of {size} does not fit in the memory of {device}; use fewer of either") from None
+    live = agent.memory.initial(args.num_envs, device)
+    play = Play(obs, live, np.zeros(args.num_envs), np.zeros(args.num_envs, np.int64))
 
-    name = f"{args.env_id.replace('/', '-').replace(':', '-')}__{args.exp_name}__{args.seed}__{int(time.time())}"
-    folder = os.path.join("runs", name)
-    os.makedirs(folder)
+    folder = new_folder(args)
+    recorder = LaneRecorder(envs, os.path.join(folder, "videos")) if args.capture_video else None
     if args.track:
-        start_tracking(args, name)
+        start_tracking(args, os.path.basename(folder))
+    return Run(envs, agent, optimizer, rollout, play, recorder, folder, open_writer(args, folder))
+
+
+def new_folder(args: Args) -> str:
+    """Name a run folder that does not exist yet: a second run that begins in the same second gets a number."""
+    env_id = args.env_id.replace("/", "-").replace(":", "-")
+    folder = os.path.join("runs", f"{env_id}__{args.exp_name}__{args.seed}__{int(time.time())}")
+    numbered = (f"{folder}-{number}" for number in itertools.count(2))
+    return folder if not os.path.exists(folder) else next(name for name in numbered if not os.path.exists(name))
+
+
+def open_writer(args: Args, folder: str) -> SummaryWriter:
+    """Make the run folder and its TensorBoard file, which begins with the hyperparameters.
+
+    Raises OSError if the folder cannot be made.
+    """
+    try:
+        os.makedirs(folder)
+    except OSError as error:
+        raise OSError(f"cannot make {folder} ({error.strerror}); run where the folder runs can be written") from None
     writer = SummaryWriter(folder)
     rows = "\n".join(f"|{key}|{value}|" for key, value in asdict(args).items())
     writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
-    return Run(envs, agent, obs, device, folder, writer)
+    return writer
 
 
 def start_tracking(args: Args, name: str) -> None:
-    """Mirror the TensorBoard curves to Weights and Biases."""
-    wandb = importlib.import_module("wandb")
-    wandb.init(
-        project=args.wandb_project_name,
-        entity=args.wandb_entity,
-        sync_tensorboard=True,
-        config=asdict(args),
-        name=name,
-        save_code=True,
-    )
+    """Mirror the TensorBoard curves to Weights and Biases; raise ValueError if that does not start."""
+    wandb = require("wandb", "--track", "track")
+    try:
+        wandb.init(
+            project=args.wandb_project_name,
+            entity=args.wandb_entity,
+            sync_tensorboard=True,
+            config=asdict(args),
+            name=name,
+            save_code=True,
+        )
+    except Exception as error:  # whatever wandb raises: no account, no such team, no network
+        raise ValueError(f"--track: {error}; log in with `wandb login`, or leave --track out") from None
 
 
 def train(args: Args, run: Run) -> str:
-    """Train for --total-timesteps, rounded down to whole iterations; return the run folder."""
-    agent, device = run.agent, run.device
-    optimizer = torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)
-    rollout = make_rollout(agent, run.obs, args.num_steps, device)
-    play = Play(
-        run.obs, agent.memory.initial(args.num_envs, device), np.zeros(args.num_envs), np.zeros(args.num_envs, np.int64)
-    )
-    recorder = LaneRecorder(run.envs, os.path.join(run.folder, "videos")) if args.capture_video else None
+    """Train for --total-timesteps, rounded down to whole iterations, or until Ctrl-C; return the run folder."""
     recent = {"return": deque(maxlen=100), "length": deque(maxlen=100)}
     batch_size = args.num_envs * args.num_steps
     start = time.perf_counter()
     bar = tqdm(total=args.total_timesteps // batch_size * batch_size, unit=" steps", unit_scale=True)
     with bar, contextlib.suppress(KeyboardInterrupt):  # Ctrl-C ends the training early and keeps what was learned
         for step in range(0, bar.total, batch_size):
-            schedule = {
-                "charts/learning_rate": anneal(step, args.init_lr, args.final_lr, args.anneal_steps),
-                "charts/entropy_coefficient": anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps),
-            }
-            optimizer.param_groups[0]["lr"] = schedule["charts/learning_rate"]
-            last_value, episodes = collect(agent, run.envs, play, rollout, args, recorder)
-            losses = update(agent, optimizer, rollout, last_value, schedule["charts/entropy_coefficient"], args)
+            lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
+            ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
+            run.optimizer.param_groups[0]["lr"] = lr
+            last_value, episodes = collect(run.agent, run.envs, run.play, run.rollout, args, run.recorder)
+            scalars = update(run.agent, run.optimizer, run.rollout, last_value, ent_coef, args)
 
             bar.update(batch_size)
             speed = bar.n / (time.perf_counter() - start)
-            means = {name: float(np.mean(values)) for name, values in episodes.items()}
-            for name, value in {**schedule, **losses, **means, "charts/SPS": speed}.items():
+            scalars |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef, "charts/SPS": speed}
+            scalars |= {name: float(np.mean(values)) for name, values in episodes.items()}
+            for name, value in scalars.items():
                 run.writer.add_scalar(name, value, bar.n)
             for name, window in recent.items():
                 window.extend(episodes.get(f"charts/episodic_{name}", []))
             shown = {name: f"{np.mean(window):.2f}" for name, window in recent.items() if window}
             bar.set_postfix({**shown, "SPS": f"{speed:.0f}"})
     if args.save_model:
-        save_model(agent, args, os.path.join(run.folder, "model.pt"))
+        save_model(run.agent, args, os.path.join(run.folder, "model.pt"))
     run.writer.close()
     run.envs.close()
     return run.folder
 
 
 def main(args: Args) -> str:
-    """Train an agent as the arguments say; return the run folder."""
+    """Train an agent as the arguments say; return the run folder. Raises what `setup` raises."""
     return train(args, setup(args))
 
 

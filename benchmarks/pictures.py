@@ -12,21 +12,25 @@ from PIL import Image
 
 import memory_gym_envs  # noqa: F401 (registers the ids)
 
-GAP = 8  # white pixels between two views
+
+def joined(pictures: list[np.ndarray], axis: int, gap: int = 8) -> np.ndarray:
+    """Join pictures of the same size along an axis, with white pixels in between."""
+    shape = list(pictures[0].shape)
+    shape[axis] = gap
+    white = np.full(shape, 255, np.uint8)
+    return np.concatenate([part for picture in pictures for part in (white, picture)][1:], axis)
 
 
 def column(env: gym.Env, observation: np.ndarray) -> np.ndarray:
     """Return the agent's view above the debug view, both 336 pixels wide."""
-    debug = env.render()
-    view = observation.repeat(4, axis=0).repeat(4, axis=1)
-    return np.concatenate([view, np.full((GAP, *view.shape[1:]), 255, np.uint8), debug])
+    return joined([observation.repeat(4, axis=0).repeat(4, axis=1), env.render()], axis=0)
 
 
-def mortar_mayhem() -> np.ndarray:
+def mortar_mayhem(seed: int = 3) -> np.ndarray:
     """Return four moments: a command is shown, the agent walks, the right tile stays blue, it stands on a wrong one."""
     env = gym.make("MortarMayhem-v0", render_mode="debug_rgb_array")
-    observation, info = env.reset(seed=SEED, options={"command_count": [2]})
-    columns, rewarded, done = [column(env, observation)], False, False
+    observation, info = env.reset(seed=seed, options={"command_count": [2]})
+    columns, rewarded = [column(env, observation)], False
     for step in range(1000):
         target = info["ground_truth"] * 4  # the target's tile, for an arena of five
         centre = (target * 14 + 14).astype(int)
@@ -39,11 +43,7 @@ def mortar_mayhem() -> np.ndarray:
         rewarded |= reward > 0
         if done:
             break
-    space = np.full((len(columns[0]), GAP, 3), 255, np.uint8)
-    return np.concatenate([part for each in columns for part in (each, space)][:-1], axis=1)
-
-
-SEED = 3  # the second command is not "stay"
+    return joined(columns, axis=1)
 
 
 if __name__ == "__main__":

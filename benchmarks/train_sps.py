@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 import tyro
 
@@ -53,14 +52,10 @@ def seconds(work: Callable[[], None], device: torch.device) -> float:
 
 def script_iteration(script, args, run) -> Callable[[], None]:
     """Return a function that does one training iteration of the script."""
-    optimizer = torch.optim.AdamW(run.agent.parameters(), lr=args.init_lr, fused=True)
-    rollout = script.make_rollout(run.agent, run.obs, args.num_steps, run.device)
-    live = run.agent.memory.initial(args.num_envs, run.device)
-    play = script.Play(run.obs, live, np.zeros(args.num_envs), np.zeros(args.num_envs, np.int64))
 
     def iteration() -> None:
-        last_value, _ = script.collect(run.agent, run.envs, play, rollout, args, None)
-        script.update(run.agent, optimizer, rollout, last_value, args.init_ent_coef, args)
+        last_value, _ = script.collect(run.agent, run.envs, run.play, run.rollout, args, None)
+        script.update(run.agent, run.optimizer, run.rollout, last_value, args.init_ent_coef, args)
 
     return iteration
 
@@ -75,6 +70,7 @@ def bound_iteration(network: torch.nn.Module, args, device: torch.device, chunk:
             for _ in range(args.num_steps):
                 network(frames[: args.num_envs])
         for _ in range(args.update_epochs * args.num_envs * args.num_steps // chunk):
+            network.zero_grad()
             network(frames[:chunk]).sum().backward()
 
     return iteration
@@ -87,21 +83,23 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], int]:
     args = tyro.cli(script.Args, args=[*flags, str(num_steps), *config.flags])
     short = tyro.cli(script.Args, args=[*flags, "32", *config.flags])
     run = script.setup(args)
+    device = run.rollout.values.device
     cnn = script.AtariCNN(3, max(config.chunks))
     encoder = torch.nn.Sequential(cnn, torch.nn.Linear(3136, run.agent.memory.width), torch.nn.ReLU())
-    trials = {chunk: bound_iteration(cnn, short, run.device, chunk) for chunk in config.chunks}
-    best = min(trials, key=lambda chunk: min(seconds(trials[chunk], run.device) for _ in range(3)))
+    trials = {chunk: bound_iteration(cnn, short, device, chunk) for chunk in config.chunks}
+    best = min(trials, key=lambda chunk: min(seconds(trials[chunk], device) for _ in range(3)))
     work = {
         "script": script_iteration(script, args, run),
-        "convolutions": bound_iteration(cnn, args, run.device, best),
-        "encoder": bound_iteration(encoder, args, run.device, best),
+        "convolutions": bound_iteration(cnn, args, device, best),
+        "encoder": bound_iteration(encoder, args, device, best),
     }
     work["script"]()  # the first iteration allocates
     times = {name: [] for name in work}
     for _ in range(config.rounds):
         for name, iteration in work.items():
-            times[name].append(seconds(iteration, run.device))
+            times[name].append(seconds(iteration, device))
     run.envs.close()
+    run.writer.close()
     return {name: config.num_envs * num_steps / statistics.median(taken) for name, taken in times.items()}, best
 
 

@@ -37,7 +37,7 @@ def scalars():
 
 @pytest.fixture
 def played(tiny):
-    """Set up an agent and play some rollouts, without learning; the last one is kept in rollout."""
+    """Set up an agent and play some rollouts, without learning; the last one stays in run.rollout."""
 
     def play(iterations=1, weights_scale=1.0, **changes):
         args = tiny(**changes)
@@ -45,11 +45,8 @@ def played(tiny):
         with torch.no_grad():  # the initial policy hardly depends on its input; a test needs one that does
             for parameter in run.agent.heads.parameters():
                 parameter.mul_(weights_scale)
-        rollout = ppo_gru.make_rollout(run.agent, run.obs, args.num_steps, run.device)
-        live = run.agent.memory.initial(args.num_envs, run.device)
-        state = ppo_gru.Play(run.obs, live, *torch.zeros(2, args.num_envs).numpy())
         for _ in range(iterations):
-            last_value, episodes = ppo_gru.collect(run.agent, run.envs, state, rollout, args, None)
-        return args, run, rollout, state, last_value, episodes
+            last_value, episodes = ppo_gru.collect(run.agent, run.envs, run.play, run.rollout, args, None)
+        return args, run, last_value, episodes
 
     return play

@@ -1,11 +1,12 @@
 """Losses and schedules against values worked out by hand."""
 
+import dataclasses
 import math
 
 import pytest
 import torch
 
-from ppo_gru import anneal, explained_variance, policy_loss, value_loss
+from ppo_gru import anneal, explained_variance, minibatch_loss, policy_loss, value_loss
 
 
 def test_policy_loss_clips_every_branch_by_itself():
@@ -43,3 +44,21 @@ def test_explained_variance():
     assert explained_variance(returns, returns) == 1.0
     assert explained_variance(torch.zeros(4), returns) == pytest.approx(0.0)
     assert math.isnan(explained_variance(returns, torch.ones(4)))
+
+
+def test_the_total_loss_is_composed_as_in_equation_5_7(played):
+    args, run, *_ = played(env_id="CueRecall-v0", vf_coef=3.0)
+    rollout, agent = run.rollout, run.agent
+    with torch.no_grad():
+        for parameter in agent.heads.policy[-1].parameters():
+            parameter.zero_()
+        rollout.log_probs.fill_(math.log(0.5))  # what this uniform policy would have stored
+    pieces = agent.memory.cut(rollout.terminated)
+    targets = rollout.rewards + 1, rollout.rewards
+    loss, logs = minibatch_loss(agent, rollout, targets, pieces, 5.0, args)
+    assert logs["losses/entropy"].item() == pytest.approx(2 * math.log(2)), "the sum over both branches"
+    assert logs["losses/policy_loss"].item() == pytest.approx(-targets[0].mean().item())
+    parts = logs["losses/policy_loss"] + 3.0 * logs["losses/value_loss"] - 5.0 * logs["losses/entropy"]
+    assert loss.item() == pytest.approx(parts.item())
+    normalized = minibatch_loss(agent, rollout, targets, pieces, 5.0, dataclasses.replace(args, norm_adv=True))[1]
+    assert normalized["losses/policy_loss"].item() == pytest.approx(0.0, abs=1e-5), "advantages of mean zero"

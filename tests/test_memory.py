@@ -18,22 +18,24 @@ MEMORIES = [
 ]
 
 
-def recompute(run, rollout):
+def recompute(run):
     """Evaluate the whole rollout in one batch of pieces; return the pieces' steps, ratios and values."""
+    rollout = run.rollout
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
     steps = pieces.steps()
     obs = {name: part.flatten(0, 1)[steps] for name, part in rollout.obs.items()}
     policy, values = run.agent.evaluate(obs, pieces, rollout.memory)
     log_probs = ppo_gru.log_probs_of(policy, rollout.actions.flatten(0, 1)[steps])
-    return pieces, steps, (log_probs - rollout.log_probs.flatten(0, 1)[steps]).exp(), values
+    return steps, (log_probs - rollout.log_probs.flatten(0, 1)[steps]).exp(), values
 
 
 @pytest.mark.parametrize("env_id", ["CueRecall-v0", "MortarMayhemB-Grid-v0", "Endless-MortarMayhem-v0"])
 @pytest.mark.parametrize("memory", MEMORIES)
 def test_ratio_is_one_for_every_sample(played, env_id, memory):
     # Three rollouts of 16 steps: episodes end inside them and go on from one to the next.
-    _, run, rollout, *_ = played(iterations=3, weights_scale=3.0, env_id=env_id, **memory)
-    _, steps, ratio, values = recompute(run, rollout)
+    _, run, *_ = played(iterations=3, weights_scale=3.0, env_id=env_id, **memory)
+    rollout = run.rollout
+    steps, ratio, values = recompute(run)
     assert (ratio - 1).abs().max() < 1e-5
     torch.testing.assert_close(values, rollout.values.flatten(0, 1)[steps], atol=1e-5, rtol=0)
     if env_id == "CueRecall-v0":
@@ -44,21 +46,21 @@ def test_ratio_is_one_for_every_sample(played, env_id, memory):
 @pytest.mark.parametrize("memory", MEMORIES[:-1])
 def test_ratio_error_sees_a_broken_memory(played, memory):
     """Guards the guard: with the stored hidden states lost, the ratios are off."""
-    _, run, rollout, *_ = played(iterations=3, weights_scale=3.0, env_id="CueRecall-v0", **memory)
-    rollout.memory.zero_()
-    assert (recompute(run, rollout)[2] - 1).abs().max() > 1e-4
+    _, run, *_ = played(iterations=3, weights_scale=3.0, env_id="CueRecall-v0", **memory)
+    run.rollout.memory.zero_()
+    assert (recompute(run)[1] - 1).abs().max() > 1e-4
 
 
 @pytest.mark.parametrize("memory", MEMORIES)
 def test_bootstrap_value_is_the_next_step_s_value(played, memory):
-    args, run, rollout, state, last_value, _ = played(iterations=2, env_id="CueRecall-v0", **memory)
-    ppo_gru.collect(run.agent, run.envs, state, rollout, args, None)
-    torch.testing.assert_close(rollout.values[0], last_value, atol=1e-6, rtol=0)
+    args, run, last_value, _ = played(iterations=2, env_id="CueRecall-v0", **memory)
+    ppo_gru.collect(run.agent, run.envs, run.play, run.rollout, args, None)
+    torch.testing.assert_close(run.rollout.values[0], last_value, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("memory", MEMORIES[:-1])
 def test_an_episode_begins_with_an_empty_memory(played, memory):
-    _, _, rollout, *_ = played(env_id="CueRecall-v0", **memory)
+    rollout = played(env_id="CueRecall-v0", **memory)[1].rollout
     begins = rollout.terminated[:-1]
     assert begins.any()
     assert (rollout.memory[1:][begins] == 0).all()
@@ -73,7 +75,8 @@ def gradients(agent):
 @pytest.mark.parametrize("memory", MEMORIES[:-1])
 @pytest.mark.parametrize("fill", [1e6, float("nan")])
 def test_padding_changes_nothing(played, memory, fill, monkeypatch):
-    args, run, rollout, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
+    args, run, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
+    rollout = run.rollout
     targets = rollout.rewards - rollout.values, rollout.rewards
 
     def learn():
@@ -82,7 +85,7 @@ def test_padding_changes_nothing(played, memory, fill, monkeypatch):
         run.agent.zero_grad()
         loss, _ = ppo_gru.minibatch_loss(run.agent, rollout, targets, pieces, 1e-3, args)
         loss.backward()
-        return recompute(run, rollout)[2:], loss.detach(), gradients(run.agent)
+        return recompute(run)[1:], loss.detach(), gradients(run.agent)
 
     clean = learn()
     pad = ppo_gru.pad_sequence
@@ -90,14 +93,15 @@ def test_padding_changes_nothing(played, memory, fill, monkeypatch):
     filled = learn()
     torch.testing.assert_close(filled[0], clean[0], atol=0, rtol=0)
     torch.testing.assert_close(filled[1], clean[1], atol=0, rtol=0)
-    if math.isfinite(fill):  # a gradient of zero through NaN is NaN by arithmetic, whoever multiplies
+    if math.isfinite(fill):  # the weights' gradient is a sum over all rows, and zero times NaN is NaN
         torch.testing.assert_close(filled[2], clean[2], atol=1e-8, rtol=1e-6)
 
 
 @pytest.mark.parametrize("memory", MEMORIES[:-1])
 def test_no_gradient_crosses_the_end_of_an_episode(played, memory):
     """The value of an episode's first step depends on that step alone, later ones on all steps of their piece."""
-    _, run, rollout, *_ = played(env_id="CueRecall-v0", **memory)
+    _, run, *_ = played(env_id="CueRecall-v0", **memory)
+    rollout = run.rollout
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
     x = torch.randn(int(pieces.length.sum()), 32, requires_grad=True)
     y = run.agent.memory.unroll(x, pieces, rollout.memory)
@@ -115,7 +119,7 @@ def test_gru_equals_a_loop_over_cells():
     cell = torch.nn.GRUCell(8, 8).double()
     cell.load_state_dict({name.removesuffix("_l0"): value for name, value in memory.rnn.state_dict().items()})
     x, live = torch.randn(3, 6, 8).double(), torch.randn(3, 1, 8).double()
-    y, after = memory.run(x, live)
+    y, after = memory.recur(x, live)
     h = live[:, 0]
     for t in range(6):
         h = cell(x[:, t], h)
@@ -124,32 +128,41 @@ def test_gru_equals_a_loop_over_cells():
 
 
 def test_the_encoder_sees_each_step_once_an_epoch_and_no_padding(played, monkeypatch):
-    args, run, rollout, _, last_value, _ = played(env_id="CueRecall-v0")
+    args, run, last_value, _ = played(env_id="CueRecall-v0")
     rows, runs = [], []
     run.agent.encoder.register_forward_pre_hook(lambda _, inputs: rows.append(len(inputs[0]["observation"])))
-    unroll = run.agent.memory.run
-    monkeypatch.setattr(run.agent.memory, "run", lambda x, live: (runs.append(1), unroll(x, live))[1])
-    optimizer = torch.optim.SGD(run.agent.parameters(), lr=0.0)
-    ppo_gru.update(run.agent, optimizer, rollout, last_value, 0.0, args)
+    recur = run.agent.memory.recur
+    monkeypatch.setattr(run.agent.memory, "recur", lambda x, live: (runs.append(1), recur(x, live))[1])
+    ppo_gru.update(run.agent, run.optimizer, run.rollout, last_value, 0.0, args)
     assert sum(rows) == args.update_epochs * args.num_envs * args.num_steps
     assert len(runs) == args.update_epochs * args.num_minibatches, "no loop over time"
     rows.clear()
-    live = run.agent.memory.initial(args.num_envs, run.device)
-    ppo_gru.collect(run.agent, run.envs, ppo_gru.Play(run.obs, live, np.zeros(4), np.zeros(4)), rollout, args, None)
+    ppo_gru.collect(run.agent, run.envs, run.play, run.rollout, args, None)
     assert rows == [args.num_envs] * (args.num_steps + 1), "no loop over lanes"
 
 
-def test_storage_does_not_grow_and_pixels_stay_bytes(played):
-    args, _, rollout, *_ = played(iterations=3, env_id="Endless-MortarMayhem-v0", hidden_size=8)
-    assert rollout.obs["observation"].dtype == torch.uint8
-    assert rollout.obs["observation"].shape == (args.num_steps, args.num_envs, 84, 84, 3)
-    assert rollout.memory.shape == (args.num_steps, args.num_envs, 1, 8)
+def test_a_long_episode_takes_no_more_memory_than_a_short_one(played):
+    """5,000 steps of endless episodes: the same storage, bytes for pixels, a live memory of the same size."""
+    changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"explosion_delay": [1000]}', "hidden_size": 4}
+    args, run, *_ = played(num_envs=1, num_steps=50, num_minibatches=1, **changes)
+
+    def storage():
+        parts = {**run.rollout.obs, **{k: v for k, v in vars(run.rollout).items() if k != "obs"}}
+        return {name: (part.data_ptr(), part.shape, part.dtype) for name, part in parts.items()}
+
+    before = storage()
+    assert before["observation"][1:] == ((50, 1, 84, 84, 3), torch.uint8)
+    for _ in range(99):
+        ppo_gru.collect(run.agent, run.envs, run.play, run.rollout, args, None)
+    assert run.play.lengths[0] > 900
+    assert storage() == before
+    assert run.play.live.shape == (1, 1, 4)
 
 
 def test_truncation_bootstraps_with_the_final_observation_and_the_memory_before_the_reset(played):
-    options = '{"max_steps": 5}'
-    changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": options, "seed": 3}
-    args, run, rollout, *_ = played(bootstrap_truncated=True, **changes)
+    changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"max_steps": 5}', "seed": 3}
+    args, run, *_ = played(bootstrap_truncated=True, **changes)
+    rollout = run.rollout
     assert rollout.truncated[4].all()
     assert not rollout.terminated.any()
     assert (rollout.truncation_values != 0).equal(rollout.truncated)
@@ -163,8 +176,25 @@ def test_truncation_bootstraps_with_the_final_observation_and_the_memory_before_
         *_, infos = envs.step(rollout.actions[t].numpy())
     final = {"observation": torch.from_numpy(np.stack(infos["final_obs"]))}
     torch.testing.assert_close(rollout.truncation_values[4], run.agent.act(final, live)[1].detach(), atol=1e-6, rtol=0)
-    _, _, plain, *_ = played(**changes)
-    assert (plain.truncation_values == 0).all()
+    assert (played(**changes)[1].rollout.truncation_values == 0).all()
+
+
+def test_update_hands_the_rollout_to_gae(played, monkeypatch):
+    args, run, last_value, _ = played(env_id="CueRecall-v0", gamma=0.9, gae_lambda=0.8)
+    seen = {}
+    gae = ppo_gru.gae
+    monkeypatch.setattr(ppo_gru, "gae", lambda **given: (seen.update(given), gae(**given))[1])
+    ppo_gru.update(run.agent, run.optimizer, run.rollout, last_value, 0.0, args)
+    names = ("rewards", "values", "terminated", "truncated", "truncation_values")
+    assert all(seen[name] is getattr(run.rollout, name) for name in names)
+    assert (seen["last_value"] is last_value, seen["gamma"], seen["gae_lambda"]) == (True, 0.9, 0.8)
+
+
+def test_an_environment_that_resets_in_the_next_step_is_refused(tiny, monkeypatch):
+    envs = ppo_gru.gym.make_vec("CueRecall-v0", 4, vectorization_mode="sync")
+    monkeypatch.setattr(ppo_gru, "make_envs", lambda *_: envs)
+    with pytest.raises(ValueError, match="does not reset an ended episode in the same step"):
+        ppo_gru.setup(tiny(env_id="CueRecall-v0"))
 
 
 def test_autoreset_is_in_the_same_step():

@@ -66,8 +66,8 @@ def test_no_piece_spans_an_episode_s_end():
 def test_padded_length_is_the_longest_piece(seq_len, monkeypatch):
     memory = Memory(Args(hidden_size=4, seq_len=seq_len))
     seen = []
-    run = memory.run
-    monkeypatch.setattr(memory, "run", lambda x, live: (seen.append(x.shape), run(x, live))[1])
+    recur = memory.recur
+    monkeypatch.setattr(memory, "recur", lambda x, live: (seen.append(x.shape), recur(x, live))[1])
     done = torch.zeros(32, 3, dtype=torch.bool)
     done[[4, 20]] = True
     pieces = memory.cut(done)

@@ -3,13 +3,16 @@
 import glob
 import math
 import os
+import re
 import subprocess
 import sys
+import types
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import ppo_gru
 
@@ -26,7 +29,9 @@ class Image(gym.Env):
     """Channels other than three, float pixels beside a vector, and a Discrete action space that starts at 1."""
 
     observation_space = gym.spaces.Dict(
-        frame=gym.spaces.Box(0.0, 1.0, (40, 36, 2), np.float32), speed=gym.spaces.Box(-1.0, 1.0, (3,), np.float64)
+        frame=gym.spaces.Box(0.0, 1.0, (40, 36, 2), np.float32),
+        speed=gym.spaces.Box(-1.0, 1.0, (3,), np.float64),
+        state=gym.spaces.Box(0, 255, (2,), np.uint8),
     )
     action_space = gym.spaces.Discrete(3, start=1)
 
@@ -39,7 +44,7 @@ class Image(gym.Env):
     def step(self, action):
         assert action in self.action_space
         self.t += 1
-        return self.observation_space.sample(), float(action), False, self.t == 5, {}
+        return self.observation_space.sample(), float(action), False, self.t == 5, {"solved": np.bool_(self.t == 5)}
 
 
 gym.register("Image-v0", entry_point=Image)
@@ -64,6 +69,13 @@ def test_logs_every_number_of_the_final_info(tiny, scalars):
     assert curves["episode/reward"] == curves["charts/episodic_return"]
     assert curves["episode/length"] == curves["charts/episodic_length"]
     assert 4 <= min(curves["episode/length"]) <= max(curves["episode/length"]) <= 8, "the options are in force"
+
+
+def test_other_settings(tiny, scalars):
+    settings = {"norm_adv": True, "clip_vloss": False, "bootstrap_truncated": True, "num_layers": 2, "seq_len": 3}
+    curves = scalars(ppo_gru.main(tiny(env_id="Image-v0", **settings)))
+    assert all(math.isfinite(value) for name in CURVES for value in curves[name])
+    assert set(curves["episode/solved"]) == {1.0}
 
 
 def test_no_finished_episode_yet(tiny, scalars):
@@ -92,16 +104,39 @@ def test_same_seed_same_curves(tiny, scalars):
 
 def test_lanes_differ_and_neighbouring_seeds_share_none(tiny):
     first = [ppo_gru.setup(tiny(env_id="MortarMayhem-v0", seed=seed, exp_name=str(seed))) for seed in (1, 2)]
-    frames = torch.cat([run.obs["observation"] for run in first]).flatten(1)
+    frames = torch.cat([run.play.obs["observation"] for run in first]).flatten(1)
     assert len(frames.unique(dim=0)) > 5  # of 8; some levels begin alike
 
 
 def test_trains_on_the_levels_asked_for_from_the_first_episode_on(played):
-    _, run, rollout, *_ = played(env_id="MortarMayhemB-Grid-v0", num_levels=3, start_level=10, num_steps=1)
-    seen = set(run.envs.np_random_seed)
-    _, run, rollout, *_ = played(env_id="MortarMayhemB-Grid-v0", num_levels=3, start_level=10, exp_name="later")
-    assert rollout.terminated.any()
+    changes = {"env_id": "MortarMayhemB-Grid-v0", "num_levels": 3, "start_level": 10}
+    seen = set(played(num_steps=1, num_minibatches=1, **changes)[1].envs.np_random_seed)
+    _, run, *_ = played(**changes)
+    assert run.rollout.terminated.any()
     assert seen | set(run.envs.np_random_seed) <= {10, 11, 12}
+
+
+def test_runs_that_begin_in_the_same_second_keep_apart(tiny, monkeypatch):
+    monkeypatch.setattr(ppo_gru.time, "time", lambda: 7.0)
+    folders = [ppo_gru.main(tiny(env_id="CueRecall-v0")) for _ in range(3)]
+    assert [folder.rpartition("__")[2] for folder in folders] == ["7", "7-2", "7-3"]
+
+
+def test_hyperparameters_are_written_down(tiny):
+    folder = ppo_gru.main(tiny(env_id="CueRecall-v0", gamma=0.123))
+    events = EventAccumulator(folder)
+    events.Reload()
+    (text,) = events.Tensors("hyperparameters/text_summary")
+    assert b"|gamma|0.123|" in text.tensor_proto.string_val[0]
+
+
+def test_tracking(tiny, monkeypatch):
+    started = {}
+    monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(init=lambda **given: started.update(given)))
+    folder = ppo_gru.main(tiny(env_id="CueRecall-v0", track=True, wandb_entity="us"))
+    assert (started["entity"], started["sync_tensorboard"]) == ("us", True)
+    assert started["name"] == os.path.basename(folder)
+    assert started["config"]["env_id"] == "CueRecall-v0"
 
 
 def test_interrupting_keeps_what_was_learned(tiny, monkeypatch):
@@ -123,17 +158,18 @@ def test_annealing(tiny, scalars):
 
 
 def test_target_kl_ends_the_epochs(played, monkeypatch):
-    args, run, rollout, _, last_value, _ = played(env_id="CueRecall-v0", update_epochs=5, target_kl=1e-9)
+    args, run, last_value, _ = played(env_id="CueRecall-v0", update_epochs=5, target_kl=1e-9)
     steps = []
     optimizer = torch.optim.SGD(run.agent.parameters(), lr=1.0)
     monkeypatch.setattr(optimizer, "step", lambda step=optimizer.step: (steps.append(1), step()))
-    ppo_gru.update(run.agent, optimizer, rollout, last_value, 0.0, args)
+    ppo_gru.update(run.agent, optimizer, run.rollout, last_value, 0.0, args)
     assert len(steps) == args.num_minibatches
 
 
 def test_logged_divergences(played):
     """KL and clip fraction are what their names say: log-ratios of 0.2 in one of two branches, on every step."""
-    args, run, rollout, _, _, _ = played(env_id="CueRecall-v0", clip_coef=0.1)
+    args, run, *_ = played(env_id="CueRecall-v0", clip_coef=0.1)
+    rollout = run.rollout
     rollout.log_probs[..., 0] -= 0.2
     pieces = run.agent.memory.cut(rollout.terminated)
     _, logs = ppo_gru.minibatch_loss(run.agent, rollout, (rollout.rewards, rollout.rewards), pieces, 0.0, args)
@@ -164,11 +200,11 @@ def test_capture_video(tiny):
 
 
 def test_command_line(tmp_path):
-    flags = "--env-id MortarMayhem-Grid-v0 --total-timesteps 64 --num-envs 2 --num-steps 16 --num-minibatches 2"
+    flags = "--env-id MortarMayhem-Grid-v0 --total-timesteps 128 --num-envs 2 --num-steps 64 --num-minibatches 2"
     command = [sys.executable, SCRIPT, *flags.split(), "--hidden-size", "16", "--no-cuda", "--save-model"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    assert "SPS" in done.stderr
+    assert re.search(r"return=-?\d.*length=\d.*SPS=\d", done.stderr), "the progress bar"
     (folder,) = (tmp_path / "runs").iterdir()
     assert folder.name.startswith("MortarMayhem-Grid-v0__ppo_gru__1__")
     assert (folder / "model.pt").exists()
