@@ -5,6 +5,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import ppo_gru
 
+torch.set_num_threads(1)  # the networks here are so small that threads would mostly wait for each other
+
 
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path, monkeypatch):

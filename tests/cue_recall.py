@@ -1,8 +1,8 @@
 """CueRecall-v0: the smallest task that cannot be solved without memory.
 
-Two cues are shown at the first step only and asked for ten to twelve blank steps later. Observation (5,): both cues
-one-hot, then whether this step asks. Action MultiDiscrete([2, 2]): a guess of each cue, heard only when asked for.
-Reward, at the end: the share of cues that are right, so 1 at best and 0.5 for guessing.
+A cue is shown at the first step only and asked for ten to twelve blank steps later. Observation (3,): the cue one-hot,
+then whether this step asks. Action MultiDiscrete([2, 2]): each branch names a cue, heard only when asked for.
+Reward, at the end: the share of branches that are right, so 1 at best and 0.5 for guessing.
 """
 
 import gymnasium as gym
@@ -10,24 +10,24 @@ import numpy as np
 
 
 class CueRecall(gym.Env):
-    observation_space = gym.spaces.Box(0.0, 1.0, (5,), np.float32)
+    observation_space = gym.spaces.Box(0.0, 1.0, (3,), np.float32)
     action_space = gym.spaces.MultiDiscrete([2, 2])
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.cues = self.np_random.integers(0, 2, 2)
+        self.cue = int(self.np_random.integers(2))
         self.blanks = int(self.np_random.integers(10, 13))
         self.t = 0
-        obs = np.zeros(5, np.float32)
-        obs[[0, 2, *self.cues]] = 1
+        obs = np.zeros(3, np.float32)
+        obs[self.cue] = 1
         return obs, {}
 
     def step(self, action):
         self.t += 1
         asked = self.t == self.blanks + 2
-        reward = float(np.mean(np.asarray(action) == self.cues)) if asked else 0.0
-        obs = np.zeros(5, np.float32)
-        obs[4] = self.t == self.blanks + 1
+        reward = float(np.mean(np.asarray(action) == self.cue)) if asked else 0.0
+        obs = np.zeros(3, np.float32)
+        obs[2] = self.t == self.blanks + 1
         return obs, reward, asked, False, {"right": reward} if asked else {}
 
 

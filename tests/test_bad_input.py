@@ -34,7 +34,6 @@ CASES = {
     "--exp-name ../up": "--exp-name is '../up'; it must be a name without slashes",
     "--env-id CueRecall-v0 --capture-video": "CueRecall-v0 cannot be made: .*render_mode",
     "--load-model missing.pt": "there is no file missing.pt; --save-model writes model.pt",
-    "--load-model /dev/null": "/dev/null is not a model that --save-model wrote",
 }
 
 
@@ -116,13 +115,17 @@ def test_a_model_of_another_network(tiny):
     with pytest.raises(ValueError, match="another network"):
         ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path))
     torch.save({"weights": 1}, path)
-    with pytest.raises(ValueError, match="is not a model"):
+    with pytest.raises(ValueError, match="is not a model that --save-model wrote"):
         ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path))
 
 
+def test_a_model_file_that_is_none(tiny, tmp_path):
+    (tmp_path / "notes.pt").write_text("some notes")
+    assert setup_error(tiny(env_id="CueRecall-v0", load_model="notes.pt")).startswith("notes.pt is not a model")
+
+
 def test_missing_extras(tiny, monkeypatch):
-    monkeypatch.setitem(sys.modules, "moviepy", None)
-    monkeypatch.delitem(sys.modules, "moviepy.video.io.ImageSequenceClip", raising=False)
+    monkeypatch.setitem(sys.modules, "moviepy.video.io.ImageSequenceClip", None)
     message = '--capture-video needs moviepy: pip install -e ".[play]"'
     assert setup_error(tiny(capture_video=True)) == message
     monkeypatch.setitem(sys.modules, "wandb", None)
