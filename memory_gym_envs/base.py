@@ -16,11 +16,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from memory_gym_envs.drawing import magnify
-from memory_gym_envs.options import resolve
+from memory_gym_envs.options import LONGEST_LIST, resolve
 
 RENDER_MODES = ("rgb_array", "debug_rgb_array")
 DEBUG_ZOOM = 4  # the debug view is 336 x 336
 ALL = slice(None)  # every lane
+NO_LIMIT = np.iinfo(np.int64).max  # of steps
+# Arrays without dimensions: a generator takes them faster than numbers, and draws the same.
+ZERO, BELOW = np.array(0), [np.array(limit) for limit in range(LONGEST_LIST + 1)]
 LEVEL_STREAM = 1  # keeps the generator that chooses levels apart from the one that builds them
 
 
@@ -276,6 +279,12 @@ class MemoryGymVectorEnv(VectorEnv):
             final_info[key], final_info[f"_{key}"] = column, mask.copy()
         final_info.update(ground_truth=truth, _ground_truth=mask.copy())
         return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask.copy()}
+
+
+def widened(array: np.ndarray, width: int) -> np.ndarray:
+    """The same rows with room for at least `width` columns."""
+    missing = width - array.shape[1]
+    return array if missing <= 0 else np.pad(array, ((0, 0), (0, missing)))
 
 
 def _choices(space: gym.Space) -> int:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import ALL, DEBUG_ZOOM, MemoryGymVectorEnv
+from memory_gym_envs.base import ALL, BELOW, DEBUG_ZOOM, NO_LIMIT, ZERO, MemoryGymVectorEnv, widened
 from memory_gym_envs.character import (
     FACINGS,
     PAD,
@@ -40,7 +40,6 @@ VECTOR_COMMANDS = 20  # commands that the command vector has room for
 BLANK = 0  # what a clue shows between commands; 1 + command otherwise
 
 EVERY_LANE = np.True_  # a mask, when no lane has to be left out
-NO_LIMIT = np.iinfo(np.int64).max
 
 
 # ---- configuration ----
@@ -146,12 +145,6 @@ def empty_state(lanes: int) -> State:
     return State(**{name: np.zeros((lanes, *shapes.get(name, ())), kinds.get(name, np.int64)) for name in names})
 
 
-def widened(array: np.ndarray, width: int) -> np.ndarray:
-    """The same rows with room for at least `width` columns."""
-    missing = width - array.shape[1]
-    return array if missing <= 0 else np.pad(array, ((0, 0), (0, missing)))
-
-
 # ---- levels ----
 
 
@@ -192,10 +185,6 @@ def draw_walk(rng: np.random.Generator, tile: tuple[int, int], count: int, size:
         command, tile = valid[rng.integers(ZERO, BELOW[len(valid)])]
         commands.append(command)
     return commands
-
-
-# Arrays without dimensions: the generator takes them faster than numbers, and draws the same.
-ZERO, BELOW = np.array(0), [np.array(limit) for limit in range(len(COMMANDS) + 1)]
 
 
 @cache
