@@ -16,14 +16,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from memory_gym_envs.drawing import magnify
-from memory_gym_envs.options import LONGEST_LIST, resolve
+from memory_gym_envs.options import resolve
 
 RENDER_MODES = ("rgb_array", "debug_rgb_array")
 DEBUG_ZOOM = 4  # the debug view is 336 x 336
 ALL = slice(None)  # every lane
 NO_LIMIT = np.iinfo(np.int64).max  # of steps
-# Arrays without dimensions: a generator takes them faster than numbers, and draws the same.
-ZERO, BELOW = np.array(0), [np.array(limit) for limit in range(LONGEST_LIST + 1)]
 LEVEL_STREAM = 1  # keeps the generator that chooses levels apart from the one that builds them
 
 

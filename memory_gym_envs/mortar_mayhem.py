@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import ALL, BELOW, DEBUG_ZOOM, NO_LIMIT, ZERO, MemoryGymVectorEnv, widened
+from memory_gym_envs.base import ALL, DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, widened
 from memory_gym_envs.character import (
     FACINGS,
     PAD,
@@ -185,6 +185,10 @@ def draw_walk(rng: np.random.Generator, tile: tuple[int, int], count: int, size:
         command, tile = valid[rng.integers(ZERO, BELOW[len(valid)])]
         commands.append(command)
     return commands
+
+
+# Arrays without dimensions: the generator takes them faster than numbers, and draws the same.
+ZERO, BELOW = np.array(0), [np.array(limit) for limit in range(len(COMMANDS) + 1)]
 
 
 @cache

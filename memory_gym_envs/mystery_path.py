@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import BELOW, DEBUG_ZOOM, NO_LIMIT, ZERO, MemoryGymVectorEnv, widened
+from memory_gym_envs.base import DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, widened
 from memory_gym_envs.character import (
     FACINGS,
     PAD,
@@ -41,6 +41,8 @@ MAP_STRIDES = np.array([ROWS, 1])
 
 PIT = 0  # the step of the path at places that are none; the path's own steps count from 1, the origin
 NOWHERE = -1  # the cell of that step
+NO_STEP = -1  # where an agent is while it is put back
+BRANCHES = np.array([3, 1])  # numbers the actions of two branches
 
 EAST, NORTH, SOUTH, WEST = range(4)
 HEADINGS = {ROWS: EAST, -1: NORTH, 1: SOUTH, -ROWS: WEST}  # by the difference of two cells
@@ -136,8 +138,10 @@ class State:
     show_past: np.ndarray  # (N,) bool
     show_ground: np.ndarray  # (N,) bool
     show_stamina: np.ndarray  # (N,) bool
+    extras: np.ndarray  # (N,) bool: one of these, but for the past path
     feedback: np.ndarray  # (N,) bool
     camera: np.ndarray  # (N,) float64: pixels between the screen's left edge and the path's, when the agent is there
+    depth: np.ndarray  # (N,) columns of the past path that are shown, and the agent's own
     lap: np.ndarray  # (N,) pixels after which the background starts again
     figure_x: np.ndarray  # (N,) where the agent is drawn, in the endless id
     cross_x: np.ndarray  # (N,) likewise the cross
@@ -155,7 +159,7 @@ def empty_state(lanes: int, segments: int) -> State:
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("pos", "origin", "tile"), (2,))
     shapes |= {"walls": (segments,), "speed": (1,), "step_at": cells, "known": cells}
     shapes |= dict.fromkeys(("cell", "heading_at", "fresh", "restful"), steps)
-    flags = ("fallen", "fresh", "restful", "known", "feedback")
+    flags = ("fallen", "fresh", "restful", "known", "extras", "feedback")
     kinds: dict[str, Any] = dict.fromkeys((*flags, *(f"show_{what}" for what in SHOWN)), bool)
     kinds |= dict.fromkeys(("returned", "camera"), np.float64) | {"heading_at": np.uint8}
     kinds |= dict.fromkeys(("reward_goal", "reward_fall_off", "reward_progress", "reward_step"), np.float64)
@@ -193,11 +197,8 @@ def make_room(s: State, steps: int, segments: int) -> bool:
 # While a path is drawn, a place is column * SIDE + row of a 7 x 7 grid, and a set of places is an integer's bits.
 PLACES = [divmod(place, SIDE) for place in range(SIDE * SIDE)]
 CELLS = [column * ROWS + BEYOND + row for column, row in PLACES]
-INSIDE = [place for place, (x, y) in enumerate(PLACES) if 0 < x < SIDE - 2 and 0 < y < SIDE - 2]
-BORDER = [place for place, spot in enumerate(PLACES) if 0 in spot or SIDE - 1 in spot]
 STRAIGHT = ((1, 0), (-1, 0), (0, 1), (0, -1))  # in the original's order
 OBLIQUE = ((1, 1), (-1, -1), (1, -1), (-1, 1))
-EDGES = 2 * SIDE * (SIDE - 1)  # pairs of neighbouring places
 
 
 def _neighbours(x: int, y: int, moves: tuple[tuple[int, int], ...]) -> list[int]:
@@ -205,10 +206,56 @@ def _neighbours(x: int, y: int, moves: tuple[tuple[int, int], ...]) -> list[int]
     return [spot[0] * SIDE + spot[1] for spot in spots if spot in PLACES]
 
 
-NEIGHBOURS = [_neighbours(x, y, STRAIGHT) for x, y in PLACES]
-NEAR = [sum(1 << each for each in _neighbours(x, y, ((0, 0), *STRAIGHT))) for x, y in PLACES]
-AROUND = [sum(1 << each for each in _neighbours(x, y, STRAIGHT + OBLIQUE)) for x, y in PLACES]
+def _bits(places: list[int]) -> int:
+    return sum(1 << place for place in places)
+
+
+NEIGHBOURS = [[(place, 1 << place) for place in _neighbours(x, y, STRAIGHT)] for x, y in PLACES]
+NEAR = [_bits(_neighbours(x, y, ((0, 0), *STRAIGHT))) for x, y in PLACES]
+# Every inner place that may become a wall, with the eight around it; and the places of the border.
+INSIDE = [
+    (1 << place, _bits(_neighbours(x, y, STRAIGHT + OBLIQUE)))
+    for place, (x, y) in enumerate(PLACES)
+    if 0 < x < SIDE - 2 and 0 < y < SIDE - 2
+]
+BORDER = [1 << place for place, spot in enumerate(PLACES) if 0 in spot or SIDE - 1 in spot]
 DISTANCES = [[math.sqrt((a - x) ** 2 + (b - y) ** 2) for a, b in PLACES] for x, y in PLACES]
+
+
+class Tape:
+    """What a generator is about to draw, read ahead: a path takes a hundred numbers, and asking for each is slow.
+
+    All bounded integers are made of the generator's 32-bit words, which are drawn here at once. In the end, the
+    generator goes back and draws those that were used.
+    """
+
+    def __init__(self, rng: np.random.Generator, paths: int):
+        self.rng, self.before, self.used = rng, rng.bit_generator.state, 0
+        # A path takes 113 words at most, and one more for every number in ten million, which is drawn again.
+        self.words = rng.integers(0, 1 << 32, 120 * paths, np.uint32).tolist()
+
+    def below(self, limit: int) -> int:
+        """What Generator.integers(0, limit) would draw (Lemire's method)."""
+        if limit == 1:
+            return 0
+        while True:
+            product = self.words[self.used] * limit
+            self.used += 1
+            if (product & 0xFFFFFFFF) >= limit or (product & 0xFFFFFFFF) >= (1 << 32) % limit:
+                return product >> 32
+
+    def dice(self, count: int) -> list[int]:
+        """So many numbers below 100."""
+        products = [word * 100 for word in self.words[self.used : self.used + count]]
+        if min([product & 0xFFFFFFFF for product in products]) < (1 << 32) % 100:
+            return [self.below(100) for _ in range(count)]
+        self.used += count
+        return [product >> 32 for product in products]
+
+    def close(self) -> None:
+        """Leaves the generator as if it had drawn the used words only."""
+        self.rng.bit_generator.state = self.before
+        self.rng.integers(0, 1 << 32, self.used, np.uint32)
 
 
 class Level(NamedTuple):
@@ -220,64 +267,68 @@ class Level(NamedTuple):
 
 def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
     """Draws a level in the original's order, so that its seeds mean the same here."""
+    tape = Tape(rng, FIRST_SEGMENTS if variant.endless else 1)
     if variant.endless:
-        return draw_segments(rng, int(rng.integers(ZERO, BELOW[SIDE])), 0, FIRST_SEGMENTS)
-    choices = values["cardinal_origin_choice"]
-    side = choices[rng.integers(ZERO, BELOW[len(choices)])]
-    start, end = (int(rng.integers(ZERO, BELOW[SIDE])) for _ in range(2))
-    near, far = (0, SIDE - 1) if side in (0, 2) else (SIDE - 1, 0)
-    if side in (0, 1):
-        start, end = near * SIDE + start, far * SIDE + end
+        level = draw_segments(tape, tape.below(SIDE), 0, FIRST_SEGMENTS)
     else:
-        start, end = start * SIDE + near, end * SIDE + far
-    walls = draw_walls(rng, start, end)
-    return Level([CELLS[place] for place in draw_path(rng, walls, start, end)], [walls])
+        choices = values["cardinal_origin_choice"]
+        side = choices[tape.below(len(choices))]
+        start, end = tape.below(SIDE), tape.below(SIDE)
+        near, far = (0, SIDE - 1) if side in (0, 2) else (SIDE - 1, 0)
+        if side in (0, 1):
+            start, end = near * SIDE + start, far * SIDE + end
+        else:
+            start, end = start * SIDE + near, end * SIDE + far
+        walls = draw_walls(tape, start, end)
+        level = Level([CELLS[place] for place in draw_path(tape, walls, start, end)], [walls])
+    tape.close()
+    return level
 
 
-def draw_segments(rng: np.random.Generator, row: int, first: int, count: int) -> Level:
+def draw_segments(tape: Tape, row: int, first: int, count: int) -> Level:
     """Draws segments of an endless path, from this row on, the first of them being segment number `first`."""
     path, every_wall = [], []
     for segment in range(first, first + count):
-        start, end = row, (SIDE - 1) * SIDE + int(rng.integers(ZERO, BELOW[SIDE]))
-        walls = draw_walls(rng, start, end)
+        start, end = row, (SIDE - 1) * SIDE + tape.below(SIDE)
+        walls = draw_walls(tape, start, end)
         shift = segment * SEGMENT * ROWS
-        path += [CELLS[place] + shift for place in draw_path(rng, walls, start, end)]
+        path += [CELLS[place] + shift for place in draw_path(tape, walls, start, end)]
         path.append(path[-1] + ROWS)  # the transition tile
         every_wall.append(walls)
         row = end % SIDE
     return Level(path, every_wall)
 
 
-def draw_walls(rng: np.random.Generator, start: int, end: int) -> int:
+def draw_walls(tape: Tape, start: int, end: int) -> int:
     """A set of untraceable places: some inside, some on the border that touch neither those nor start and end.
 
     So there always is a path: along the border, and one ring further inside past the walls that stand there.
     """
-    dice = rng.integers(0, 100, len(INSIDE)).tolist()  # draws what a call for each would
-    walls = sum(1 << place for place, die in zip(INSIDE, dice, strict=True) if die < 33)
-    open_ends = NEAR[start] | NEAR[end]
-    free = [place for place in BORDER if not (open_ends >> place & 1 or AROUND[place] & walls)]
-    for _ in range((4, 8)[rng.integers(ZERO, BELOW[2])]):
+    walls, kept_free = 0, NEAR[start] | NEAR[end]
+    for (place, around), die in zip(INSIDE, tape.dice(len(INSIDE)), strict=True):
+        if die < 33:
+            walls |= place
+            kept_free |= around
+    free = [place for place in BORDER if not place & kept_free]
+    for _ in range((4, 8)[tape.below(2)]):
         if free:
-            walls |= 1 << free.pop(rng.integers(ZERO, BELOW[len(free)]))
+            walls |= free.pop(tape.below(len(free)))
     return walls
 
 
-def draw_path(rng: np.random.Generator, walls: int, start: int, end: int) -> list[int]:
+def draw_path(tape: Tape, walls: int, start: int, end: int) -> list[int]:
     """The path that A* finds over random costs, not always the cheapest: its places from start to end."""
-    # One call draws as many costs as the search can ask for. Then the generator goes back and draws what was used.
-    before = rng.bit_generator.state
-    costs, used = rng.integers(1, 9, EDGES).tolist(), 0
-    closed = [walls >> place & 1 for place in range(SIDE * SIDE)]
+    words, used, closed = tape.words, tape.used, walls
     cost, total, previous = [0] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
-    distance, opened = DISTANCES[end], [start]
-    while (here := _promising(opened, total)) != end:
+    distance, opened, here = DISTANCES[end], [start], start
+    while here != end:
         opened.remove(here)
-        closed[here] = 1
-        for place in NEIGHBOURS[here]:
-            if closed[place]:
+        closed |= 1 << here
+        so_far = cost[here] + 1
+        for place, bit in NEIGHBOURS[here]:
+            if closed & bit:
                 continue
-            there = cost[here] + costs[used]
+            there = so_far + (words[used] >> 29)  # a cost of 1 to 8
             used += 1
             if not cost[place]:
                 cost[place], total[place], previous[place] = there, there + distance[place], here
@@ -285,21 +336,19 @@ def draw_path(rng: np.random.Generator, walls: int, start: int, end: int) -> lis
             elif there < cost[place]:
                 # The original leaves the higher cost as it is.
                 previous[place] = here
-    rng.bit_generator.state = before
-    rng.integers(1, 9, used)
+        # Not the least total: the first that is less than the first of all, as in the original.
+        least = total[opened[0]]
+        for here in opened:
+            if total[here] < least:
+                break
+        else:
+            here = opened[0]
+    tape.used = used
     path = [end]
-    while path[-1] != start:
-        path.append(previous[path[-1]])
+    while here != start:
+        here = previous[here]
+        path.append(here)
     return path[::-1]
-
-
-def _promising(opened: list[int], total: list[float]) -> int:
-    """The first place that promises less than the first of all does, as the original chooses; not the least."""
-    least = total[opened[0]]
-    for place in opened:
-        if total[place] < least:
-            return place
-    return opened[0]
 
 
 def write_level(s: State, lane: int, level: Level, values: dict[str, Any], variant: Variant) -> None:
@@ -316,7 +365,7 @@ def write_level(s: State, lane: int, level: Level, values: dict[str, Any], varia
         s.pos[lane, axis] = s.origin[lane, axis] = start * TILE + radius + PAD
         s.tile[lane, axis] = (start * TILE + radius) // TILE
     s.facing[lane] = 6 if variant.endless else 0
-    s.step[lane] = s.at[lane] = 1
+    s.step[lane], s.at[lane] = NO_STEP, 1  # the first step lands on the origin
     s.heading[lane] = s.heading_at[lane, 1]
     s.stamina[lane] = s.stamina_level[lane]
 
@@ -346,13 +395,15 @@ BLUE, GREEN, RED = (0, 0, 255), (0, 255, 0), (255, 0, 0)
 CROSS = 10  # width of the cross
 BAR = 4  # width of the stamina bar
 PAST, STEP, ORIGIN, GOAL, WALL = range(5)  # rows of tiles()
-LONGEST_TRAIL = (2 * SIDE - 1) * SIDE  # steps that can be drawn behind an agent: those on less than two segments
+BACK = np.arange(1, (2 * SIDE - 1) * SIDE + 1)  # steps back that can be drawn: those on less than two segments
 
 
+@cache
 def tile_picture(inner: tuple[int, int, int], border: tuple[int, int, int]) -> np.ndarray:
-    """(TILE, TILE, 3) uint8: a tile with a border of one pixel."""
+    """(TILE, TILE, 3) uint8, read-only: a tile with a border of one pixel."""
     picture = np.tile(np.array(border, np.uint8), (TILE, TILE, 1))
     picture[1:-1, 1:-1] = inner
+    picture.flags.writeable = False
     return picture
 
 
@@ -403,9 +454,11 @@ def draw(s: State, sheet: Sheet, lanes: np.ndarray | slice, endless: bool) -> np
 def draw_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     """Black (n, FRAME), with the path's origin and goal where they are shown."""
     frames = np.zeros((len(s.at[lanes]), FRAME), np.uint8)
+    if not np.count_nonzero(s.extras[lanes]):
+        return frames
     for shown, kind in ((s.show_origin[lanes], ORIGIN), (s.show_goal[lanes], GOAL)):
         if np.count_nonzero(shown):
-            which = np.flatnonzero(shown)
+            (which,) = shown.nonzero()
             step = s.count[lanes][which] if kind == GOAL else 1
             cell = s.cell[lanes][which, step]
             paste(frames, tiles(), np.full(len(which), kind), tile_centres(cell), which)
@@ -419,24 +472,16 @@ def tile_centres(cell: np.ndarray) -> np.ndarray:
 
 def draw_endless_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     """(n, FRAME): black or the background, and the path behind the agent where it is shown."""
-    walked = s.pos[lanes, 0] - s.origin[lanes, 0]
-    # Starts again as soon as it has moved by a tile or more, which jumps if the speed does not divide that.
-    frames = grounds().take((walked % s.lap[lanes] + 1) * s.show_ground[lanes], axis=0)
-    which = np.flatnonzero(s.show_past[lanes] & (s.tile[lanes, 0] > 0))
-    if not which.size:
-        return frames
-    owner, cell = trail(s, which if isinstance(lanes, slice) else lanes[which])
-    owner = which[owner]  # (m,)
-    # A camera between two pixels cuts the fraction off, towards zero.
-    x = (cell // ROWS * TILE - (walked - s.camera[lanes])[owner]).astype(np.int64)
-    y = (cell % ROWS - BEYOND) * TILE
-    whole = (x >= 0) & (x <= SCREEN - TILE)
-    cut = ~whole & (x > -TILE) & (x < SCREEN)
-    if np.count_nonzero(cut):
-        centres = np.stack([x[cut], y[cut]], axis=1) + TILE // 2 + PAD
-        # Before the whole tiles, which then cover what the cut ones' squares have of them.
-        paste(frames, tiles(), np.full(len(centres), PAST), centres, owner[cut])
-    stamp(frames, tile_picture(WHITE, GREY), owner[whole], x[whole], y[whole])
+    column, walked = s.tile[lanes, 0], s.pos[lanes, 0] - s.origin[lanes, 0]
+    if np.count_nonzero(s.extras[lanes]):
+        # Starts again as soon as it has moved by a tile or more, which jumps if the speed does not divide that.
+        frames = grounds().take((walked % s.lap[lanes] + 1) * s.show_ground[lanes], axis=0)
+    else:
+        frames = np.zeros((len(column), FRAME), np.uint8)
+    (which,) = ((np.minimum(column, s.at[lanes] - 1) > 0) & s.show_past[lanes]).nonzero()
+    if which.size:
+        owner, cell = trail(s, which if isinstance(lanes, slice) else lanes[which])
+        draw_trail(frames, which[owner], cell, walked - s.camera[lanes])
     return frames
 
 
@@ -445,31 +490,51 @@ def trail(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     From the last step but one backwards, up to the first that is as far to the left as the camera's offset in tiles.
     """
-    at, left = s.at[lanes], np.maximum(s.tile[lanes, 0] - 1 - s.camera[lanes].astype(np.int64) // TILE, 0)
-    back = np.arange(min(int(at.max()), LONGEST_TRAIL))  # (K,)
-    steps = np.maximum(at[:, None] - 1 - back, PIT)  # (n, K)
+    at = s.at[lanes]
+    bound = np.maximum(s.tile[lanes, 0] - s.depth[lanes], 1) * ROWS  # (n,) cells below that are far enough left
+    back = BACK[: int(at.max())]  # (K,)
+    steps = at[:, None] - back  # (n, K)
+    np.maximum(steps, PIT, out=steps)
     cells = s.cell.take(steps + lanes[:, None] * s.cell.shape[1])  # (n, K)
-    # The last column of `back` or one before it is at the pit, whose cell is left of everything, or far enough left.
-    last = (cells < (left[:, None] + 1) * ROWS).argmax(axis=1)  # (n,)
-    owner, drawn = np.nonzero((back <= last[:, None]) & (steps != PIT))
-    return owner, cells[owner, drawn]
+    # At the latest, a trail ends at the pit, whose cell is left of everything.
+    last = (cells < bound[:, None]).argmax(axis=1)  # (n,)
+    owner, which = np.nonzero((back <= last[:, None] + 1) & (cells != NOWHERE))
+    return owner, cells[owner, which]
+
+
+def draw_trail(frames: np.ndarray, owner: np.ndarray, cell: np.ndarray, camera: np.ndarray) -> None:
+    """Draws the cells' tiles on their owners' frames, in place. camera: (n,) the screen's left edge on the path."""
+    column, row = np.divmod(cell, ROWS)
+    # A camera between two pixels cuts the fraction off, towards zero.
+    x, y = (column * TILE - camera[owner]).astype(np.int64), (row - BEYOND) * TILE
+    whole = (x >= 0) & (x <= SCREEN - TILE)
+    if np.count_nonzero(whole) < len(whole):
+        cut = ~whole & (x > -TILE) & (x < SCREEN)
+        centres = np.stack([x[cut], y[cut]], axis=1) + TILE // 2 + PAD
+        # Before the whole tiles, which then cover what the cut ones' squares have of them.
+        paste(frames, tiles(), np.full(len(centres), PAST), centres, owner[cut])
+        owner, x, y = owner[whole], x[whole], y[whole]
+    stamp(frames, tile_picture(WHITE, GREY), owner, x, y)
 
 
 def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: np.ndarray | slice, endless: bool) -> None:
     """Draws the agents, their stamina and their crosses on the frames (n, FRAME), in place."""
-    pos = cross = s.pos[lanes]
+    pos = s.pos[lanes]
     if endless:
-        y = np.minimum(np.maximum(pos[:, 1], 0), SPAN - 1)  # off the screen
-        pos, cross = np.stack([s.figure_x[lanes], y], axis=1), np.stack([s.cross_x[lanes], y], axis=1)
+        pos = np.maximum(pos, 0)
+        np.minimum(pos, SPAN - 1, out=pos)  # off the screen
+        pos[:, 0] = s.figure_x[lanes]
     paste(frames, sheet, s.figure[lanes] * FACINGS + s.facing[lanes], pos)
-    shown = s.show_stamina[lanes]
-    if np.count_nonzero(shown):
+    if np.count_nonzero(s.extras[lanes]):
+        shown = s.show_stamina[lanes]
         spent = (SCREEN * (1 - s.stamina[lanes] / s.stamina_level[lanes])).astype(np.int64)  # (n,) pixels
         frames.reshape(-1, SCREEN, ROW)[shown, :, -3 * BAR :] = bars()[spent[shown]]
-    hurt = s.fallen[lanes] & s.feedback[lanes]
-    if np.count_nonzero(hurt):
-        which = np.flatnonzero(hurt)
-        paste(frames, crosses(), np.zeros_like(which), cross[which], which)
+    (which,) = (s.fallen[lanes] & s.feedback[lanes]).nonzero()
+    if which.size:
+        cross = pos[which]
+        if endless:
+            cross[:, 0] = s.cross_x[lanes][which]
+        paste(frames, crosses(), np.zeros_like(which), cross, which)
 
 
 # ---- rules ----
@@ -479,35 +544,43 @@ ENDLESS_MOVES = np.array([(0, 0), (1, 0), (0, -1), (0, 1)])  # (4, 2)
 ENDLESS_TURN = np.array([(facing, 6, 0, 4) for facing in range(FACINGS)])  # (8, 4) the next facing
 
 
-def land(s: State, lane_map: np.ndarray, lane_path: np.ndarray) -> np.ndarray:
-    """Looks up the path's step under every agent; (N,) bool whose tile it had not reached before.
+def land(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: bool) -> None:
+    """What happens on another tile, or in the pit. Where the agent has not moved on, this changes nothing.
 
-    lane_map, lane_path: (N,) where the lane's cells start in the flattened map, and its steps in the flattened path.
+    lane_path: (N,) where the lane's steps start in the flattened path. rewards: (N,), changed in place.
     """
-    s.step = s.step_at.take(s.tile @ MAP_STRIDES + lane_map)
-    s.fallen = s.step == PIT
     s.at = np.where(s.fallen, s.at, s.step)
     here = s.step + lane_path
     fresh = s.fresh.take(here)
-    s.fresh.put(here, False)
-    return fresh
-
-
-def tire(s: State, lane_map: np.ndarray, lane_path: np.ndarray) -> np.ndarray:
-    """The endless id's own rules: stamina, and how far the agent got. (N,) bool whose episode is over."""
-    here, column = s.step + lane_path, s.tile[:, 0]
-    # The origin gives stamina back, too, and so does falling off, as in the original.
-    np.copyto(s.stamina, s.stamina_level, where=s.restful.take(here) | s.fallen)
-    s.restful.put(here, False)
-    s.stamina -= 1
-    over = s.stamina == 0
+    if np.count_nonzero(fresh):
+        rewards += fresh * s.reward_progress
+        s.visited += fresh
+        s.fresh.put(here, False)
     if np.count_nonzero(s.fallen):
-        cell = s.tile @ MAP_STRIDES + lane_map
-        over |= s.fallen & ((column < s.furthest) | s.known.take(cell))
-        # Never forgotten: the original means to, on progress, but compares before there can be any.
-        s.known.put(cell[s.fallen], True)
-        s.restful[s.fallen, 1:] = True
-    s.furthest = np.where(s.fallen, s.furthest, np.maximum(s.furthest, column))
+        rewards += s.fallen * s.reward_fall_off
+        s.fails += s.fallen
+    heading = s.heading_at.take(s.at + lane_path)
+    # The endless id's ground truth has no entry for the west.
+    s.heading = np.where(heading == WEST, s.heading, heading) if endless else heading
+
+
+def rest(s: State, lane_path: np.ndarray) -> None:
+    """The endless id: gives stamina back on a tile for the first time since the last fall. So does the origin."""
+    here = s.step + lane_path
+    np.copyto(s.stamina, s.stamina_level, where=s.restful.take(here))
+    s.restful.put(here, False)
+
+
+def fall(s: State, cell: np.ndarray) -> np.ndarray:
+    """The endless id: gives stamina back to those in the pit; (N,) bool whose fall ends the episode.
+
+    cell: (N,) the agents' places in the flattened map.
+    """
+    over = s.fallen & ((s.tile[:, 0] < s.furthest) | s.known.take(cell))
+    # Never forgotten: the original means to, on progress, but compares before there can be any.
+    s.known.put(cell[s.fallen], True)
+    s.restful[s.fallen, 1:] = True
+    np.copyto(s.stamina, s.stamina_level, where=s.fallen)
     return over
 
 
@@ -571,6 +644,7 @@ class MysteryPath(MemoryGymVectorEnv):
         s.feedback[lanes] = values["visual_feedback"]
         for what, option in SHOWN.items():
             getattr(s, f"show_{what}")[lanes] = values.get(option, False)
+        s.extras[lanes] = any(values.get(option, False) for what, option in SHOWN.items() if what != "past")
         s.reward_goal[lanes] = values.get("reward_goal", 0.0)
         s.reward_fall_off[lanes] = values["reward_fall_off"]
         s.reward_progress[lanes] = values["reward_path_progress"]
@@ -586,7 +660,7 @@ class MysteryPath(MemoryGymVectorEnv):
     def _place_camera(self, lanes: np.ndarray, values: dict[str, Any]) -> None:
         s, scale, speed = self.state, values["agent_scale"], int(values["agent_speed"])
         camera = TILE * values["camera_offset_scale"]
-        s.camera[lanes], s.speed[lanes] = camera, speed
+        s.camera[lanes], s.depth[lanes], s.speed[lanes] = camera, int(values["camera_offset_scale"]), speed
         s.lap[lanes] = speed * math.ceil(TILE / speed) if speed else 1
         # The original cuts the fraction off at the corner of the agent's sprite, and rounds the cross's middle.
         radius, corner = radius_of(scale), (2 * radius_of(scale) + int(10 * scale) + 14) // 2
@@ -631,32 +705,42 @@ class MysteryPath(MemoryGymVectorEnv):
         s.tile = (s.pos - PAD) // TILE  # (N, 2)
         if endless:
             self._lengthen()
-        fresh = land(s, self._lane_map, self._lane_path)
-        rewards = fresh * s.reward_progress
-        if np.count_nonzero(s.fallen):
-            rewards += s.fallen * s.reward_fall_off
-            s.fails += s.fallen
-        heading = s.heading_at.take(s.at + self._lane_path)
-        if endless:
-            s.visited += fresh
-            # The ground truth has no entry for the west.
-            s.heading = np.where(heading == WEST, s.heading, heading)
-            terminated = tire(s, self._lane_map, self._lane_path)
-        else:
-            s.heading = heading
-            terminated = s.step == s.count
+        cell = s.tile.dot(MAP_STRIDES) + self._lane_map  # (N,)
+        before, s.step = s.step, s.step_at.take(cell)
+        s.fallen = s.step == PIT
+        rewards = s.reward_step.copy()
+        landed = np.count_nonzero(s.step != before)
+        if landed:
+            land(s, self._lane_path, rewards, endless)
+        terminated = self._tire(cell, landed) if endless else s.step == s.count
+        if not endless and np.count_nonzero(terminated):
             rewards += terminated * s.reward_goal
-        rewards += s.reward_step
         s.returned += rewards
-        return rewards, terminated, (s.length == s.limit) & ~terminated
+        truncated = s.length == s.limit
+        if np.count_nonzero(truncated):
+            truncated &= ~terminated
+        return rewards, terminated, truncated
+
+    def _tire(self, cell: np.ndarray, landed: int) -> np.ndarray:
+        """The endless id: who has no stamina left, or fell off where it must not; (N,) bool."""
+        s = self.state
+        if not landed:
+            s.stamina -= 1
+            return s.stamina == 0
+        rest(s, self._lane_path)
+        over = fall(s, cell) if np.count_nonzero(s.fallen) else False
+        s.furthest = np.where(s.fallen, s.furthest, np.maximum(s.furthest, s.tile[:, 0]))
+        s.stamina -= 1
+        return (s.stamina == 0) | over
 
     def _move(self, actions: np.ndarray) -> None:
         """Walks, or puts those who fell back to the origin."""
         s, endless = self.state, self.variant.endless
-        action = actions if actions.ndim == 1 else actions[:, 0] * 3 + actions[:, 1]  # (N,)
+        action = actions if actions.ndim == 1 else actions.dot(BRANCHES)  # (N,)
         if np.count_nonzero(s.fallen):
             action = np.where(s.fallen, 0, action)
             s.pos = np.where(s.fallen[:, None], s.origin, s.pos)
+            s.step[s.fallen] = NO_STEP  # what it lands on is another tile, even if that is the pit again
         if endless:
             s.facing = ENDLESS_TURN.take(s.facing * len(ENDLESS_MOVES) + action)
             s.pos = s.pos + ENDLESS_MOVES.take(action, axis=0) * s.speed
@@ -672,7 +756,9 @@ class MysteryPath(MemoryGymVectorEnv):
         for lane in np.flatnonzero(entered).tolist():
             steps, segments = int(s.count[lane]), int(s.segments[lane])
             row = int(s.cell[lane, steps]) % ROWS - BEYOND
-            level = draw_segments(self._rngs[lane], row, segments, 1)
+            tape = Tape(self._rngs[lane], 1)
+            level = draw_segments(tape, row, segments, 1)
+            tape.close()
             if make_room(s, steps + len(level.path), segments + 1):
                 self._place_tables()
             write_path(s, lane, level, self.variant)

@@ -11,7 +11,6 @@ from memory_gym_envs import MysteryPath
 from memory_gym_envs.mystery_path import (
     BEYOND,
     EAST,
-    EDGES,
     FIRST_SEGMENTS,
     NORTH,
     PIT,
@@ -21,7 +20,7 @@ from memory_gym_envs.mystery_path import (
     SOUTH,
     TILE,
     WEST,
-    draw_path,
+    Tape,
     draw_segments,
     trail,
 )
@@ -93,17 +92,25 @@ def test_endless_paths_are_joined_by_transition_tiles():
         assert s.heading_at[0, s.count[0]] == EAST
 
 
+def further(rng, *arguments):
+    """The endless path's next segments from this generator."""
+    tape = Tape(rng, FIRST_SEGMENTS)
+    level = draw_segments(tape, *arguments)
+    tape.close()
+    return level
+
+
 def test_endless_path_grows_when_its_last_segment_is_entered():
     env, s = made(ENDLESS, 1)
     rng, _ = gym.utils.seeding.np_random(1)
-    level = draw_segments(rng, int(rng.integers(0, SIDE)), 0, FIRST_SEGMENTS)
+    level = further(rng, int(rng.integers(0, SIDE)), 0, FIRST_SEGMENTS)
     for _ in range(700):
         segments, state = int(s.segments[0]), env.batch.np_random[0].bit_generator.state
         *_, over, _, _ = env.step(player(env.batch)[0])
         assert not over
         if s.tile[0, 0] == (segments - 1) * SEGMENT and s.segments[0] > segments:
             row = level.path[-1] % ROWS - BEYOND
-            level.path.extend(draw_segments(rng, row, segments, 1).path)
+            level.path.extend(further(rng, row, segments, 1).path)
         else:
             assert (s.segments[0], env.batch.np_random[0].bit_generator.state) == (segments, state)
     assert s.segments[0] > 8
@@ -111,18 +118,20 @@ def test_endless_path_grows_when_its_last_segment_is_entered():
     check_path(s, path_of(s))
 
 
-def test_a_path_takes_what_its_search_used_from_the_generator():
-    """Costs are drawn at once and given back, which must look like drawing them one by one."""
+def test_tape_draws_what_the_generator_would():
     for seed in range(20):
-        at_once, one_by_one = np.random.default_rng(seed), np.random.default_rng(seed)
-        at_once.integers(0, 7)  # leaves half of a 64-bit word behind
-        one_by_one.integers(0, 7)
-        draw_path(at_once, 0, 3, 45)
-        for _ in range(EDGES):
-            one_by_one.integers(1, 9)
-            if one_by_one.bit_generator.state == at_once.bit_generator.state:
-                break
-        assert one_by_one.bit_generator.state == at_once.bit_generator.state
+        ahead, one_by_one = np.random.default_rng(seed), np.random.default_rng(seed)
+        if seed % 2:  # half of a 64-bit word is left over
+            ahead.integers(0, 7)
+            one_by_one.integers(0, 7)
+        tape = Tape(ahead, 4)
+        limits = [1, 2, 7, 8, 100, 2**31 + 1] * 30
+        drawn = []
+        for limit in limits:
+            drawn.append(tape.below(limit))
+        tape.close()
+        assert drawn == [one_by_one.integers(0, limit) for limit in limits]
+        assert ahead.bit_generator.state == one_by_one.bit_generator.state
 
 
 # ---- falling off ----
