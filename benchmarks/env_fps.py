@@ -29,6 +29,9 @@ ORIGINALS = {
     "MortarMayhemB-v0": ("mortar_mayhem_b", "MortarMayhemTaskBEnv"),
     "MortarMayhemB-Grid-v0": ("mortar_mayhem_b_grid", "GridMortarMayhemTaskBEnv"),
     "Endless-MortarMayhem-v0": ("endless_mortar_mayhem", "EndlessMortarMayhemEnv"),
+    "MysteryPath-v0": ("mystery_path", "MysteryPathEnv"),
+    "MysteryPath-Grid-v0": ("mystery_path_grid", "GridMysteryPathEnv"),
+    "Endless-MysteryPath-v0": ("endless_mystery_path", "EndlessMysteryPathEnv"),
 }
 COLUMNS = ["id", "memory-gym", "one", "ratio", "{n} lanes", "ratio", "reset, memory-gym", "reset", "ratio"]
 ACTIONS = 256  # sampled before the clock starts

@@ -21,6 +21,7 @@ from memory_gym_envs.options import resolve
 RENDER_MODES = ("rgb_array", "debug_rgb_array")
 DEBUG_ZOOM = 4  # the debug view is 336 x 336
 ALL = slice(None)  # every lane
+NO_LIMIT = np.iinfo(np.int64).max  # of steps
 LEVEL_STREAM = 1  # keeps the generator that chooses levels apart from the one that builds them
 
 
@@ -276,6 +277,12 @@ class MemoryGymVectorEnv(VectorEnv):
             final_info[key], final_info[f"_{key}"] = column, mask.copy()
         final_info.update(ground_truth=truth, _ground_truth=mask.copy())
         return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask.copy()}
+
+
+def widened(array: np.ndarray, width: int) -> np.ndarray:
+    """The same rows with room for at least `width` columns."""
+    missing = width - array.shape[1]
+    return array if missing <= 0 else np.pad(array, ((0, 0), (0, missing)))
 
 
 def _choices(space: gym.Space) -> int:

@@ -86,13 +86,16 @@ def make_sheet(sprites: np.ndarray, solid: np.ndarray, positions: np.ndarray) ->
     )
 
 
-def paste(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray) -> None:
+def paste(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, owner: np.ndarray | None = None) -> None:
     """Pastes sprite rows[i] of the sheet into frames[i], centred at pos[i].
 
     frames: (n, FRAME) uint8, contiguous, changed in place. rows: (n,). pos: (n, 2), x and y, indices of positions.
+    owner: (m,) into which frames instead; rows and pos are (m,) and (m, 2) then. The squares that sprites of the same
+        frame cover must not overlap, those cut off at the screen's edges being moved back onto it.
     """
+    first = np.arange(0, len(frames) * SCREEN * SCREEN, SCREEN * SCREEN) if owner is None else owner * SCREEN * SCREEN
     place = pos[:, 1] * sheet.positions + pos[:, 0]  # (n,)
-    start = sheet.frame_start.take(place) + np.arange(0, len(frames) * SCREEN * SCREEN, SCREEN * SCREEN)
+    start = sheet.frame_start.take(place) + first
     source = sheet.canvas_start.take(place) + rows * (sheet.canvas * sheet.canvas)
     squares = windows(frames, SCREEN, sheet.row)  # a square never leaves its frame, as frame_start is clipped
     patch = squares[start]  # (n, W) rows
@@ -100,6 +103,16 @@ def paste(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray) -
     pixels &= sheet.keep[source].view(np.uint8)
     pixels |= sheet.ink[source].view(np.uint8)
     squares[start] = patch
+
+
+def stamp(frames: np.ndarray, picture: np.ndarray, owner: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
+    """Puts a (W, W, 3) picture without transparent pixels into frames[owner[i]], its top left pixel at x[i], y[i].
+
+    frames: (n, FRAME) uint8, contiguous, changed in place. owner, x, y: (m,). All of it must be on the screen.
+    """
+    row = np.dtype(f"V{3 * len(picture)}")
+    squares = windows(frames, SCREEN, row)
+    squares[(owner * SCREEN + y) * SCREEN + x] = picture.reshape(len(picture), -1).view(row)[:, 0]  # (W,) rows
 
 
 def windows(images: np.ndarray, across: int, row: np.dtype) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import ALL, DEBUG_ZOOM, MemoryGymVectorEnv
+from memory_gym_envs.base import ALL, DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, widened
 from memory_gym_envs.character import (
     FACINGS,
     PAD,
@@ -40,7 +40,6 @@ VECTOR_COMMANDS = 20  # commands that the command vector has room for
 BLANK = 0  # what a clue shows between commands; 1 + command otherwise
 
 EVERY_LANE = np.True_  # a mask, when no lane has to be left out
-NO_LIMIT = np.iinfo(np.int64).max
 
 
 # ---- configuration ----
@@ -144,12 +143,6 @@ def empty_state(lanes: int) -> State:
     kinds |= dict.fromkeys(("truth", "returned", "reward_success", "reward_failure", "reward_episode"), np.float64)
     names = State.__dataclass_fields__
     return State(**{name: np.zeros((lanes, *shapes.get(name, ())), kinds.get(name, np.int64)) for name in names})
-
-
-def widened(array: np.ndarray, width: int) -> np.ndarray:
-    """The same rows with room for at least `width` columns."""
-    missing = width - array.shape[1]
-    return array if missing <= 0 else np.pad(array, ((0, 0), (0, missing)))
 
 
 # ---- levels ----

@@ -2,7 +2,18 @@
 
 import numpy as np
 
+import memory_gym_envs
+from memory_gym_envs import MysteryPath
+from memory_gym_envs.mystery_path import EAST, WEST, tile_centres
+
 TILE, SCREEN = 14, 84
+FAMILY = {env_id: family for family in memory_gym_envs.FAMILIES for env_id in family.variants}
+
+
+def choices(batch) -> int:
+    """How many values each branch of an action has."""
+    space = batch.single_action_space
+    return int(space.n) if hasattr(space, "n") else int(space.nvec[0])
 
 
 def free_player(batch) -> np.ndarray:
@@ -20,10 +31,48 @@ def grid_player(batch) -> np.ndarray:
     away = (s.goal + TILE // 2 - s.pos) // TILE  # (N, 2) tiles
     along_x = away[:, 0] != 0
     wanted = np.where(along_x, np.where(away[:, 0] > 0, 6, 2), np.where(away[:, 1] > 0, 4, 0))
-    turn = np.where((wanted - s.facing) % 8 > 4, 2, 1)
-    return np.where((away == 0).all(axis=1), 0, np.where(s.facing == wanted, 3, turn))
+    return np.where((away == 0).all(axis=1), 0, turn_or_walk(s.facing, wanted))
+
+
+def turn_or_walk(facing: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """(N,) actions of a grid id: one tile forward in the wanted direction, or turn to it the short way."""
+    return np.where(facing == wanted, 3, np.where((wanted - facing) % 8 > 4, 2, 1))
+
+
+def path_grid_player(batch) -> np.ndarray:
+    """(N,) actions to the path's next tile."""
+    s = batch.state
+    heading = s.heading_at[np.arange(batch.num_envs), s.at]
+    return turn_or_walk(s.facing, np.array([6, 0, 4, 2])[heading])
+
+
+def path_free_player(batch) -> np.ndarray:
+    """(N, 2) actions to the path's next tile: first to the middle of the way there, then along it."""
+    s, lanes = batch.state, np.arange(batch.num_envs)
+    away = tile_centres(s.cell[lanes, np.minimum(s.at + 1, s.count)]) - s.pos  # (N, 2)
+    along_x = np.isin(s.heading_at[lanes, s.at], (EAST, WEST))
+    aside = np.abs(np.where(along_x, away[:, 1], away[:, 0])) > 2
+    both = np.where(away > 2, 2, np.where(away < -2, 1, 0))
+    return both * np.stack([along_x != aside, along_x == aside], axis=1)
+
+
+def path_endless_player(batch) -> np.ndarray:
+    """(N,) actions likewise. Where the path goes left, nothing."""
+    across, down = path_free_player(batch).T
+    return np.where(across == 2, 1, np.where(down > 0, down + 1, 0))
 
 
 def player(batch) -> np.ndarray:
-    """The right player for the batch's action space."""
-    return grid_player(batch) if batch.variant.grid else free_player(batch)
+    """The right player for the batch."""
+    if isinstance(batch, MysteryPath) and batch.variant.endless:
+        return path_endless_player(batch)
+    free, grid = (path_free_player, path_grid_player) if isinstance(batch, MysteryPath) else (free_player, grid_player)
+    return grid(batch) if batch.variant.grid else free(batch)
+
+
+def stumbling(batch, rng: np.random.Generator, chance: np.ndarray) -> np.ndarray:
+    """The player's actions, each lane's replaced by random ones with its chance (N,)."""
+    actions = player(batch)
+    stumble = rng.random(batch.num_envs) < chance
+    random = rng.integers(0, choices(batch), actions.shape)
+    return np.where(stumble if actions.ndim == 1 else stumble[:, None], random, actions)

@@ -14,13 +14,17 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from players import player
+from players import FAMILY, choices, player, stumbling
 
 import memory_gym_envs
-from memory_gym_envs import IDS, MortarMayhem, options_table
+from memory_gym_envs import IDS, MortarMayhem, MysteryPath, options_table
 
 EACH = pytest.mark.parametrize("env_id", IDS)
 LANES = 4
+HASTY = {  # options that end episodes soon; the end of some earns -1
+    MortarMayhem: {"explosion_delay": [2], "explosion_duration": (1,), "reward_command_failure": -1},
+    MysteryPath: {"max_steps": 9, "reward_step": -1},
+}
 
 
 def make(env_id, **arguments):
@@ -34,8 +38,7 @@ def picture(observation):
 def roll(envs, steps, seed=0):
     """Everything that some steps of random actions return."""
     rng = np.random.default_rng(seed)
-    high = 4 if envs.variant.grid else 3
-    return [envs.step(rng.integers(0, high, envs.action_space.shape)) for _ in range(steps)]
+    return [envs.step(rng.integers(0, choices(envs), envs.action_space.shape)) for _ in range(steps)]
 
 
 # ---- Gymnasium's own checks ----
@@ -51,8 +54,8 @@ def test_check_env(env_id):
 @EACH
 def test_spaces(env_id):
     env, envs = gym.make(env_id), make(env_id)
-    grid, act_only = "Grid" in env_id, "B-" in env_id
-    assert env.action_space == (gym.spaces.Discrete(4) if grid else gym.spaces.MultiDiscrete([3, 3]))
+    four, act_only = "Grid" in env_id or env_id == "Endless-MysteryPath-v0", "B-" in env_id
+    assert env.action_space == (gym.spaces.Discrete(4) if four else gym.spaces.MultiDiscrete([3, 3]))
     image = gym.spaces.Box(0, 255, (84, 84, 3), np.uint8)
     if act_only:
         vector = gym.spaces.Box(0.0, 1.0, (180,), np.float32)
@@ -70,7 +73,7 @@ def test_spaces(env_id):
 
 @EACH
 def test_metadata(env_id):
-    fps = {"MortarMayhem-Grid-v0": 6, "MortarMayhemB-Grid-v0": 1}.get(env_id, 25)
+    fps = {"MortarMayhem-Grid-v0": 6, "MortarMayhemB-Grid-v0": 1, "MysteryPath-Grid-v0": 3}.get(env_id, 25)
     env, envs = gym.make(env_id), make(env_id)
     for each in (env, envs):
         assert each.metadata["render_modes"] == ["rgb_array", "debug_rgb_array"]
@@ -87,10 +90,7 @@ def test_infos_are_those_of_sync_vector_env(env_id):
     assert data_equivalence(ours.reset(seed=3), theirs.reset(seed=3), exact=True)
     rng, ended = np.random.default_rng(0), 0
     for _ in range(200):
-        actions = player(ours)
-        stumble = rng.random(LANES) < (0.0, 0.3, 0.6, 1.0)
-        wrong = rng.integers(0, 4 if ours.variant.grid else 3, actions.shape)
-        actions = np.where(stumble.reshape(-1, *[1] * (actions.ndim - 1)), wrong, actions)
+        actions = stumbling(ours, rng, np.array([0.0, 0.3, 0.6, 1.0]))
         left, right = ours.step(actions), theirs.step(actions)
         for ours_part, theirs_part in zip(left[:4], right[:4], strict=True):
             assert data_equivalence(ours_part, theirs_part, exact=True)
@@ -180,7 +180,7 @@ def test_levels(env_id):
     automatic.reset()
     for *_, infos in roll(automatic, 130):
         assert set(automatic.np_random_seed) <= {100, 101}
-        assert infos["ground_truth"].shape == (2, 2)
+        assert infos["ground_truth"].shape == (2, len(next(iter(truth))))
 
 
 def test_unseeded_levels_differ():
@@ -200,22 +200,23 @@ def test_unseeded_levels_differ():
 
 @EACH
 def test_options_stay_until_the_next_explicit_reset(env_id):
-    envs = make(env_id)
-    options = {"explosion_delay": [2], "explosion_duration": (1,), "reward_command_failure": -1}
-    envs.reset(seed=0, options=options)
+    envs, hasty = make(env_id), HASTY[FAMILY[env_id]]
+    envs.reset(seed=0, options=hasty)
     steps = roll(envs, 200)
-    assert sum(step[2].sum() for step in steps) > LANES  # several episodes a lane
-    assert {r for step in steps for r, over in zip(step[1], step[2], strict=True) if over and r < 0} == {-1.0}
-    assert envs.state.fuse.tolist() == [2] * LANES
+    ends = [reward for step in steps for reward in step[1][step[2] | step[3]]]
+    assert len(ends) > LANES  # several episodes a lane
+    assert min(ends) == min(ends[LANES:]) == -1.0
+    assert envs.settings == [envs.resolve(hasty)] * LANES
     envs.reset()
-    assert envs.state.fuse.tolist() == [6 if envs.variant.grid else 18] * LANES
+    assert envs.settings == [envs.defaults] * LANES
+    assert all((step[1] >= 0).all() for step in roll(envs, 200))
 
 
 @EACH
 def test_every_option_in_its_range(env_id):
     """Random settings of all options at once: no exception, nothing outside the spaces."""
     rng = np.random.default_rng(0)
-    specs = MortarMayhem.variants[env_id].options
+    specs = FAMILY[env_id].variants[env_id].options
     envs = make(env_id)
     for _ in range(25):
         options = {option.name: json.loads(json.dumps(random_value(option, rng))) for option in specs}
@@ -239,7 +240,17 @@ def random_value(option, rng):
     return values if option.kind == "ints" else int(rng.choice([low, high if high <= 9 else small]))
 
 
-WRONG = [
+WRONG_ANYWHERE = [
+    ({"agent_skale": 1.0}, "'agent_skale'.*'agent_scale'.*a number from 0.04 to 1.0"),
+    ({"agent_scale": 0}, "'agent_scale'.*a number from 0.04 to 1.0"),
+    ({"agent_scale": float("nan")}, "'agent_scale'"),
+    ({"agent_scale": None}, "'agent_scale'"),
+    ({"visual_feedback": 1}, "'visual_feedback'.*true or false.*1"),
+    ({"visual_feedback": "yes"}, "'visual_feedback'"),
+    ({7: 1}, "7"),
+    ([("agent_scale", 1)], "options must be a dictionary"),
+]
+WRONG_MORTAR_MAYHEM = [
     ({"arena_sise": 3}, "'arena_sise'.*'(arena|agent)_"),
     ({"explosion_dellay": [3]}, "'explosion_dellay'.*'explosion_delay'.*a list of integers from 1 to 1000"),
     ({"explosion_delay": 18}, "'explosion_delay'.*a list of integers from 1 to 1000.*18"),
@@ -251,19 +262,23 @@ WRONG = [
     ({"allowed_commands": 3}, "'allowed_commands'.*an integer from 4 to 9.*3"),
     ({"allowed_commands": 10}, "'allowed_commands'"),
     ({"allowed_commands": True}, "'allowed_commands'"),
-    ({"agent_scale": 0}, "'agent_scale'.*a number from 0.04 to 1.0"),
-    ({"agent_scale": float("nan")}, "'agent_scale'"),
-    ({"agent_scale": None}, "'agent_scale'"),
     ({"reward_command_success": float("inf")}, "'reward_command_success'.*a number"),
-    ({"visual_feedback": 1}, "'visual_feedback'.*true or false.*1"),
-    ({"visual_feedback": "yes"}, "'visual_feedback'"),
-    ({7: 1}, "7"),
-    ([("agent_scale", 1)], "options must be a dictionary"),
+]
+WRONG_MYSTERY_PATH = [
+    ({"reward_stepp": 3}, "'reward_stepp'.*'reward_step'.*a number"),
+    ({"max_steps": 0}, "'max_steps'.*-1 or an integer of at least 1.*0"),
+    ({"max_steps": 1.5}, "'max_steps'"),
+    ({"max_steps": [128]}, "'max_steps'"),
+    ({"reward_fall_off": float("inf")}, "'reward_fall_off'.*a number"),
+    ({"show_origin": 0}, "'show_origin'.*true or false.*0"),
+]
+WRONG = {MortarMayhem: WRONG_ANYWHERE + WRONG_MORTAR_MAYHEM, MysteryPath: WRONG_ANYWHERE + WRONG_MYSTERY_PATH}
+WRONG_CASES = [
+    pytest.param(env_id, *case, id=f"{env_id}-{str(case[0])[:40]}") for env_id in IDS for case in WRONG[FAMILY[env_id]]
 ]
 
 
-@EACH
-@pytest.mark.parametrize(("options", "message"), WRONG, ids=[str(w[0])[:40] for w in WRONG])
+@pytest.mark.parametrize(("env_id", "options", "message"), WRONG_CASES)
 def test_wrong_option_changes_nothing(env_id, options, message):
     envs, env = make(env_id), gym.make(env_id)
     envs.reset(seed=0)
@@ -291,6 +306,18 @@ def test_wrong_option_changes_nothing(env_id, options, message):
         ("Endless-MortarMayhem-v0", {"arena_size": 5}),
         ("Endless-MortarMayhem-v0", {"max_steps": 0}),
         ("Endless-MortarMayhem-v0", {"initial_command_count": 0}),
+        ("MysteryPath-v0", {"cardinal_origin_choice": [0, 4]}),
+        ("MysteryPath-v0", {"cardinal_origin_choice": []}),
+        ("MysteryPath-v0", {"cardinal_origin_choice": 1}),
+        ("MysteryPath-v0", {"agent_speed": 85.0}),
+        ("MysteryPath-v0", {"stamina_level": 20}),
+        ("MysteryPath-Grid-v0", {"agent_speed": 3.0}),
+        ("MysteryPath-Grid-v0", {"reward_goal": "much"}),
+        ("Endless-MysteryPath-v0", {"reward_goal": 1.0}),
+        ("Endless-MysteryPath-v0", {"show_goal": True}),
+        ("Endless-MysteryPath-v0", {"cardinal_origin_choice": [0]}),
+        ("Endless-MysteryPath-v0", {"camera_offset_scale": 5.6}),
+        ("Endless-MysteryPath-v0", {"stamina_level": 0}),
     ],
 )
 def test_options_of_one_id_alone(env_id, options):
@@ -300,8 +327,8 @@ def test_options_of_one_id_alone(env_id, options):
 
 @EACH
 def test_options_table(env_id):
-    table = options_table(MortarMayhem.variants[env_id].options)
-    for option in MortarMayhem.variants[env_id].options:
+    table = options_table(FAMILY[env_id].variants[env_id].options)
+    for option in FAMILY[env_id].variants[env_id].options:
         assert f"| `{option.name}` | `{json.dumps(option.default)}` | {option.allowed} |" in table
         assert option.parse(option.default) == option.default
 
@@ -320,12 +347,12 @@ def test_options_table(env_id):
         ({"start_level": "a"}, "start_level"),
         ({"num_envs": 0}, "num_envs"),
         ({"num_envs": 2.0}, "num_envs"),
-        ({"variant": "MortarMayhem-v9"}, "MortarMayhem-v0, .*MortarMayhem-v9"),
+        ({"variant": "Nothing-v9"}, "variant must be one of .*-v0, .*Nothing-v9"),
     ],
 )
 def test_wrong_arguments(env_id, arguments, message):
     with pytest.raises(ValueError, match=message):
-        MortarMayhem(**{"variant": env_id, **arguments})
+        FAMILY[env_id](**{"variant": env_id, **arguments})
 
 
 @EACH
@@ -384,11 +411,12 @@ def test_reset_needed(env_id):
             each.step(each.action_space.sample())
     with pytest.raises(gym.error.ResetNeeded):
         envs.render()
-    env.reset(seed=0, options={"explosion_delay": [1], "reward_command_failure": -1.0})
+    env.reset(seed=0, options=HASTY[FAMILY[env_id]])
     over = False
     while not over:
-        *_, over, _, info = env.step(env.action_space.sample())
-    assert set(info) > {"reward", "length", "commands_completed", "ground_truth"}
+        _, _, terminated, truncated, info = env.step(env.action_space.sample())
+        over = terminated or truncated
+    assert set(info) > {"reward", "length", "ground_truth"}
     with pytest.raises(gym.error.ResetNeeded):
         env.step(env.action_space.sample())
     env.reset()
@@ -403,7 +431,7 @@ def test_reset_needed(env_id):
 @pytest.mark.parametrize("num_levels", [None, 5])
 def test_copies_have_the_same_future(env_id, clone, num_levels):
     envs = make(env_id, num_levels=num_levels)
-    envs.reset(seed=1, options={"explosion_delay": [3], "agent_scale": 0.3})
+    envs.reset(seed=1, options=HASTY[FAMILY[env_id]] | {"agent_scale": 0.3})
     roll(envs, 70)
     twin = clone(envs)
     for left, right in zip(roll(envs, 100, seed=2), roll(twin, 100, seed=2), strict=True):
@@ -443,7 +471,7 @@ def test_returned_arrays_are_the_callers(env_id):
 def roll_and_spoil(envs, steps):
     rng = np.random.default_rng(0)
     for _ in range(steps):
-        result = envs.step(rng.integers(0, 4 if envs.variant.grid else 3, envs.action_space.shape))
+        result = envs.step(rng.integers(0, choices(envs), envs.action_space.shape))
         yield copy.deepcopy(result)
         spoil(result)
 
@@ -466,14 +494,15 @@ def spoil(part):
 def test_a_frame_depends_on_this_episode_alone(env_id):
     """The original shows the last episode's agent until the new one moves."""
     env, fresh = gym.make(env_id), gym.make(env_id)
-    env.reset(seed=1, options={"explosion_delay": [3]})
+    still = np.zeros_like(env.action_space.sample())
+    env.reset(seed=1, options=HASTY[FAMILY[env_id]])
     over = False
     while not over:
-        *_, over, _, _ = env.step(3 if "Grid" in env_id else [2, 2])
+        _, _, terminated, truncated, _ = env.step(still + choices(env.unwrapped.batch) - 1)
+        over = terminated or truncated
     frames = [env.reset(seed=8), fresh.reset(seed=8)]
     assert data_equivalence(*frames, exact=True)
     for _ in range(5):
-        still = np.zeros_like(env.action_space.sample())
         assert data_equivalence(env.step(still), fresh.step(still), exact=True)
 
 
@@ -493,7 +522,7 @@ def test_render(env_id):
         assert np.array_equal(np.stack(frames), picture(observations))
 
 
-@EACH
+@pytest.mark.parametrize("env_id", MortarMayhem.variants)
 def test_debug_render_circles_the_target(env_id):
     env = gym.make(env_id, render_mode="debug_rgb_array").unwrapped
     observation, info = env.reset(seed=2)
@@ -566,5 +595,8 @@ def test_ids():
         "MortarMayhemB-v0",
         "MortarMayhemB-Grid-v0",
         "Endless-MortarMayhem-v0",
+        "MysteryPath-v0",
+        "MysteryPath-Grid-v0",
+        "Endless-MysteryPath-v0",
     }
     assert all(env_id in gym.registry for env_id in memory_gym_envs.IDS)

@@ -1,11 +1,15 @@
 """A scripted player earns exactly the known return, in exactly the known number of steps, in every id."""
 
+from itertools import pairwise
+
 import gymnasium as gym
 import numpy as np
 import pytest
-from players import player
+from players import FAMILY, player
 
 import memory_gym_envs
+from memory_gym_envs import MortarMayhem, MysteryPath
+from memory_gym_envs.mystery_path import EAST, NORTH, SOUTH, WEST
 
 # Table 4.4, but for the act tasks: the thesis' formula says 18 to 234 and 6 to 78 there. The original itself, whose
 # first command has one step more than the others, needs one step more; behind a clue the reset makes up for it.
@@ -144,21 +148,95 @@ def test_endless_player_never_fails(limit):
     assert info["max_command_sequence"] == completed
 
 
+# Mystery Path. The player walks from middle to middle, 4 steps a tile at the default speed, and a tile is reached at
+# its edge: after 2 steps when it is entered from the left or above, 3 from the right or below.
+EDGE = {EAST: 2, SOUTH: 2, WEST: 3, NORTH: 3}
+
+
+def arrival(headings: list[int]) -> int:
+    """Steps after which the player reaches the tile that these directions lead to."""
+    return 4 * (len(headings) - 1) + EDGE[headings[-1]]
+
+
+def grid_arrival(headings: list[int]) -> int:
+    """The same tile by tile, from facing north: a step a tile, and one for each quarter turn."""
+    quarter = {NORTH: 0, WEST: 1, SOUTH: 2, EAST: 3}
+    facings = [0, *(quarter[heading] for heading in headings)]
+    turns = [(b - a) % 4 for a, b in pairwise(facings)]
+    return len(headings) + sum(min(turn, 4 - turn) for turn in turns)
+
+
+@pytest.mark.parametrize("env_id", ["MysteryPath-v0", "MysteryPath-Grid-v0"])
+@pytest.mark.parametrize("seed", range(8))
+def test_player_walks_the_path(env_id, seed):
+    env = gym.make(env_id).unwrapped
+    options = {"reward_path_progress": 0.1, "reward_fall_off": -5.0}
+    rewards, terminated, truncated, info = play_out(env, lambda: player(env.batch)[0], seed, options)
+    s = env.batch.state
+    headings = s.heading_at[0, 1 : s.count[0]].tolist()
+    assert (terminated, truncated) == (True, False)
+    assert len(rewards) == info["length"] == (grid_arrival if "Grid" in env_id else arrival)(headings)
+    assert [r for r in rewards if r] == [0.1] * (len(headings) - 1) + [1.0]
+    assert info["reward"] == pytest.approx(1.0 + 0.1 * (len(headings) - 1))
+    assert (info["success"], info["num_fails"]) == (1, 0)
+
+
+@pytest.mark.parametrize("limit", [1, 2, 150, 1500])
+def test_endless_player_walks_on(limit):
+    """As far as the path does not go left, where nobody can follow."""
+    env = gym.make("Endless-MysteryPath-v0").unwrapped
+    played = 0
+    for seed in range(40):
+        options = {"max_steps": limit, "reward_fall_off": -5.0}
+        rewards, terminated, truncated, info = play_out(env, lambda: player(env.batch)[0], seed, options)
+        s = env.batch.state
+        headings = s.heading_at[0, 1 : s.count[0]].tolist()
+        if WEST in headings[: limit // 4 + 2]:
+            continue
+        tiles = [step for step in range(1, len(headings) + 1) if arrival(headings[:step]) <= limit]
+        assert (terminated, truncated) == (False, True)
+        assert len(rewards) == info["length"] == limit
+        assert info["tiles_visited"] == len(tiles) == sum(r == 0.1 for r in rewards)
+        assert info["reward"] == pytest.approx(0.1 * len(tiles))
+        assert info["max_x"] == sum(heading == EAST for heading in headings[: len(tiles)])
+        assert info["num_fails"] == 0
+        played += 1
+        if played == 3:
+            return
+    pytest.fail("there are too few levels to play")
+
+
+LANE_OPTIONS = {
+    MortarMayhem: ({"command_count": [1, 3]}, {"max_steps": 120}),  # finite, endless
+    MysteryPath: ({}, {"max_steps": 40}),
+}
+
+
 @pytest.mark.parametrize("env_id", memory_gym_envs.IDS)
 def test_players_in_lanes(env_id):
     """The same returns with automatic resets, several episodes a lane."""
-    envs = gym.make_vec(env_id, num_envs=LANES)
-    options = {"max_steps": 120} if "Endless" in env_id else {"command_count": [1, 3]}
-    envs.reset(seed=0, options=options)
+    envs, endless = gym.make_vec(env_id, num_envs=LANES), "Endless" in env_id
+    envs.reset(seed=0, options=LANE_OPTIONS[FAMILY[env_id]][endless])
     ended = 0
     for _ in range(400):
         _, _, terminated, truncated, infos = envs.step(player(envs))
         for lane in np.flatnonzero(terminated | truncated):
-            final = {key: values[lane] for key, values in infos["final_info"].items()}
             ended += 1
-            if "Endless" in env_id:
-                assert final["reward"] == pytest.approx(0.1 * endless_checks(120))
-            else:
-                assert final["success"] == 1
-                assert round(final["reward"] / 0.1) in (1, 3)
+            check_final(env_id, {key: values[lane] for key, values in infos["final_info"].items()})
     assert ended >= 2 * LANES
+
+
+def check_final(env_id, final):
+    """The final info of an episode that the player played with LANE_OPTIONS."""
+    if env_id == "Endless-MysteryPath-v0":
+        assert final["reward"] == pytest.approx(0.1 * final["tiles_visited"])
+        assert final["num_fails"] == 0
+        assert final["tiles_visited"] <= 10  # less where the path goes left
+    elif "MysteryPath" in env_id:
+        assert (final["success"], final["num_fails"]) == (1, 0)
+        assert final["reward"] == 1.0 if "Grid" in env_id else final["reward"] > 1.0
+    elif "Endless" in env_id:
+        assert final["reward"] == pytest.approx(0.1 * endless_checks(120))
+    else:
+        assert final["success"] == 1
+        assert round(final["reward"] / 0.1) in (1, 3)

@@ -10,13 +10,19 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from players import FAMILY
 
 import memory_gym_envs
+from memory_gym_envs import MortarMayhem, MysteryPath
 
 FOLDER = Path(os.environ.get("REFERENCE_TRACES") or Path(__file__).resolve().parents[1] / "data")
 FILES = sorted(path for path in FOLDER.glob("*.npz") if path.name.split(".")[0] in memory_gym_envs.IDS)
 PIXELS = 0.995  # share of a recording's pixels that agree, on average over its frames
 LANES, LANE = 3, 1
+OTHER_LANES = {
+    MortarMayhem: {"agent_scale": 0.5, "explosion_delay": [5]},
+    MysteryPath: {"agent_scale": 0.4, "max_steps": 50},
+}
 
 
 class Recording:
@@ -62,7 +68,7 @@ def test_alone(path):
         assert reward == recording.rewards[step]
         assert (terminated or truncated) == recording.dones[step]
         if truncated:
-            assert step + 1 == recording.options["max_steps"]
+            assert step + 1 == env.unwrapped.batch.settings[0]["max_steps"]
         recording.check(step + 1, observation, info["ground_truth"])
     recording.check_end(info)
 
@@ -72,7 +78,7 @@ def test_as_a_lane(path):
     """The other lanes play other levels, with other options and random actions."""
     recording = Recording(path)
     envs = gym.make_vec(recording.env_id, num_envs=LANES)
-    envs.reset(seed=5, options={"agent_scale": 0.5, "explosion_delay": [5]})
+    envs.reset(seed=5, options=OTHER_LANES[FAMILY[recording.env_id]])
     mask = np.arange(LANES) == LANE
     seeds = [None, recording.seed, None]
     observations, infos = envs.reset(seed=seeds, options={"reset_mask": mask, **recording.options})

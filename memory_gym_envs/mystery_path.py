@@ -1,0 +1,806 @@
+"""Mystery Path: find a hidden path by trial, and remember it when a false step leads back to its origin (thesis 4.4).
+
+Shape letters: N lanes, n some of them, M cells of the map, P steps of the path that fit, K of them drawn, S segments.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from memory_gym_envs.base import DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, widened
+from memory_gym_envs.character import (
+    FACINGS,
+    PAD,
+    SPAN,
+    STRIDES,
+    Figure,
+    free_controls,
+    grid_controls,
+    radius_of,
+    walk,
+    wardrobe,
+)
+from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, magnify, make_sheet, paste, stamp
+from memory_gym_envs.options import Option
+
+TILE = 12  # pixels
+SIDE = 7  # tiles along one side of the screen, and of a segment of the endless path
+SEGMENT = SIDE + 1  # columns of a segment with the transition tile behind it
+FIRST_SEGMENTS = 3  # of an endless path; more are appended as the agent gets there
+
+# A cell of the map is column * ROWS + BEYOND + row, with rows of pit above and below the screen: in the endless id
+# nothing holds the agent back there, and the largest and fastest gets nine tiles out.
+BEYOND = 9
+ROWS = BEYOND + SIDE + BEYOND
+MAP_STRIDES = np.array([ROWS, 1])
+
+PIT = 0  # the step of the path at places that are none; the path's own steps count from 1, the origin
+NOWHERE = -1  # the cell of that step
+NO_STEP = -1  # where an agent is while it is put back
+BRANCHES = np.array([3, 1])  # numbers the actions of two branches
+
+EAST, NORTH, SOUTH, WEST = range(4)
+HEADINGS = {ROWS: EAST, -1: NORTH, 1: SOUTH, -ROWS: WEST}  # by the difference of two cells
+
+
+# ---- configuration ----
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What tells one Mystery Path id from another."""
+
+    grid: bool  # turn and walk tile by tile, instead of free movement
+    endless: bool  # a path without a goal, from left to right; no walking left, and stamina
+    render_fps: int
+    options: tuple[Option, ...]
+
+
+def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
+    """The reset options of an id, in the original's order of names."""
+    steps, progress = -1 if endless else 128 if grid else 512, 0.0 if grid else 0.1
+    size, ignored = "size of the agent; 0.25: 12 pixels wide", "ignored, as in the original"
+    origin = ignored if endless else "show the path's origin in blue"
+    sides = "where the path starts: 0 left, 1 right, 2 top, 3 bottom"
+    camera = "how many tiles from the screen's left edge the agent is drawn"
+    rows = [
+        (True, Option("max_steps", steps, "int", 1, None, "steps until truncation; -1: no limit", also=(-1,))),
+        (True, Option("agent_scale", 0.25, "float", 0.04, 1.0, f"{size}; {ignored}" if grid else size)),
+        (not grid, Option("agent_speed", 3.0, "float", 0.0, 84.0, "pixels that the agent walks in a step")),
+        (not endless, Option("cardinal_origin_choice", (0, 1, 2, 3), "ints", 0, 3, f"{sides} *")),
+        (True, Option("show_origin", False, "bool", None, None, origin)),
+        (not endless, Option("show_goal", False, "bool", None, None, "show the path's goal in green")),
+        (endless, Option("show_past_path", True, "bool", None, None, "show the path behind the agent in white")),
+        (endless, Option("show_background", False, "bool", None, None, "show tiles that move as the agent walks")),
+        (endless, Option("show_stamina", False, "bool", None, None, "show how much stamina is left")),
+        (True, Option("visual_feedback", True, "bool", None, None, "show a red cross where the agent falls off")),
+        (endless, Option("camera_offset_scale", 5.0, "float", 0.0, 5.5, camera)),
+        (endless, Option("stamina_level", 20, "int", 1, None, "steps to reach the next tile in")),
+        (not endless, Option("reward_goal", 1.0, "float", None, None, "reward for reaching the goal")),
+        (True, Option("reward_fall_off", 0.0, "float", None, None, "reward for falling off the path")),
+        (True, Option("reward_path_progress", progress, "float", None, None, "reward for each tile reached first")),
+        (True, Option("reward_step", 0.0, "float", None, None, "reward for every step")),
+    ]
+    return tuple(option for present, option in rows if present)
+
+
+def _variant(fps: int, grid: bool = False, endless: bool = False) -> Variant:
+    return Variant(grid, endless, fps, _options(grid, endless))
+
+
+VARIANTS = {
+    "MysteryPath-v0": _variant(25),
+    "MysteryPath-Grid-v0": _variant(3, grid=True),
+    "Endless-MysteryPath-v0": _variant(25, endless=True),
+}
+
+
+# ---- state ----
+
+
+@dataclass
+class State:
+    """One array a field, one row a lane. Positions are stored with PAD added, tiles count from the top left."""
+
+    pos: np.ndarray  # (N, 2) the agent's centre, x and y; in the endless id x is counted along the path
+    facing: np.ndarray  # (N,)
+    figure: np.ndarray  # (N,) which of the batch's figures the agent is
+    origin: np.ndarray  # (N, 2) where the agent starts and is put back to
+    tile: np.ndarray  # (N, 2) the agent's tile, column and row
+    step: np.ndarray  # (N,) the path's step at that tile, or PIT
+    at: np.ndarray  # (N,) the path's step where the agent last was on the path
+    heading: np.ndarray  # (N,) the direction of the tile after that
+    fallen: np.ndarray  # (N,) bool: in the pit, and so put back at the next step
+    count: np.ndarray  # (N,) steps of the path; the last one is the goal
+    cell: np.ndarray  # (N, P) where each step of the path is, NOWHERE at first
+    heading_at: np.ndarray  # (N, P) uint8: the direction of the next step
+    fresh: np.ndarray  # (N, P) bool: the step has a reward for reaching it
+    restful: np.ndarray  # (N, P) bool: the step gives stamina back
+    step_at: np.ndarray  # (N, M) the inverse of cell: the step of the path that is there, or PIT
+    known: np.ndarray  # (N, M) bool: the agent fell off there before
+    walls: np.ndarray  # (N, S) each segment's untraceable places, a bit set
+    segments: np.ndarray  # (N,)
+    furthest: np.ndarray  # (N,) the rightmost column of the path reached so far
+    stamina: np.ndarray  # (N,) steps left to reach another tile
+    fails: np.ndarray  # (N,) how often the agent fell off
+    visited: np.ndarray  # (N,) tiles reached so far
+    length: np.ndarray  # (N,) steps so far
+    returned: np.ndarray  # (N,) float64: sum of rewards so far
+    # Options that the rules or the drawing need at every step.
+    speed: np.ndarray  # (N, 1) whole pixels a step, in the endless id
+    show_origin: np.ndarray  # (N,) bool
+    show_goal: np.ndarray  # (N,) bool
+    show_past: np.ndarray  # (N,) bool
+    show_ground: np.ndarray  # (N,) bool
+    show_stamina: np.ndarray  # (N,) bool
+    extras: np.ndarray  # (N,) bool: one of these, but for the past path
+    feedback: np.ndarray  # (N,) bool
+    camera: np.ndarray  # (N,) float64: pixels between the screen's left edge and the path's, when the agent is there
+    depth: np.ndarray  # (N,) columns of the past path that are shown, and the agent's own
+    lap: np.ndarray  # (N,) pixels after which the background starts again
+    figure_x: np.ndarray  # (N,) where the agent is drawn, in the endless id
+    cross_x: np.ndarray  # (N,) likewise the cross
+    limit: np.ndarray  # (N,) steps until truncation
+    stamina_level: np.ndarray  # (N,)
+    reward_goal: np.ndarray  # (N,) float64
+    reward_fall_off: np.ndarray  # (N,) float64
+    reward_progress: np.ndarray  # (N,) float64
+    reward_step: np.ndarray  # (N,) float64
+
+
+def empty_state(lanes: int, segments: int) -> State:
+    """The state of N lanes before their first reset, with room for this many segments."""
+    steps, cells = (SIDE * SIDE + 1,), (segments * SEGMENT * ROWS,)
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("pos", "origin", "tile"), (2,))
+    shapes |= {"walls": (segments,), "speed": (1,), "step_at": cells, "known": cells}
+    shapes |= dict.fromkeys(("cell", "heading_at", "fresh", "restful"), steps)
+    flags = ("fallen", "fresh", "restful", "known", "extras", "feedback")
+    kinds: dict[str, Any] = dict.fromkeys((*flags, *(f"show_{what}" for what in SHOWN)), bool)
+    kinds |= dict.fromkeys(("returned", "camera"), np.float64) | {"heading_at": np.uint8}
+    kinds |= dict.fromkeys(("reward_goal", "reward_fall_off", "reward_progress", "reward_step"), np.float64)
+    names = State.__dataclass_fields__
+    s = State(**{name: np.zeros((lanes, *shapes.get(name, ())), kinds.get(name, np.int64)) for name in names})
+    s.cell[:, PIT] = NOWHERE
+    return s
+
+
+SHOWN = {
+    "origin": "show_origin",
+    "goal": "show_goal",
+    "past": "show_past_path",
+    "ground": "show_background",
+    "stamina": "show_stamina",
+}
+
+
+def make_room(s: State, steps: int, segments: int) -> bool:
+    """Widens the state if it cannot hold a path of so many steps and segments; whether it had to."""
+    if steps < s.cell.shape[1] and segments <= s.walls.shape[1]:
+        return False
+    # By half as much again at least, so that an ever longer path seldom has to move.
+    steps, segments = max(steps + 1, s.cell.shape[1] * 3 // 2), max(segments, s.walls.shape[1] * 3 // 2)
+    for name in ("cell", "heading_at", "fresh", "restful"):
+        setattr(s, name, widened(getattr(s, name), steps))
+    for name in ("step_at", "known"):
+        setattr(s, name, widened(getattr(s, name), segments * SEGMENT * ROWS))
+    s.walls = widened(s.walls, segments)
+    return True
+
+
+# ---- levels ----
+
+# While a path is drawn, a place is column * SIDE + row of a 7 x 7 grid, and a set of places is an integer's bits.
+PLACES = [divmod(place, SIDE) for place in range(SIDE * SIDE)]
+CELLS = [column * ROWS + BEYOND + row for column, row in PLACES]
+STRAIGHT = ((1, 0), (-1, 0), (0, 1), (0, -1))  # in the original's order
+OBLIQUE = ((1, 1), (-1, -1), (1, -1), (-1, 1))
+
+
+def _neighbours(x: int, y: int, moves: tuple[tuple[int, int], ...]) -> list[int]:
+    spots = [(x + dx, y + dy) for dx, dy in moves]
+    return [spot[0] * SIDE + spot[1] for spot in spots if spot in PLACES]
+
+
+def _bits(places: list[int]) -> int:
+    return sum(1 << place for place in places)
+
+
+NEIGHBOURS = [[(place, 1 << place) for place in _neighbours(x, y, STRAIGHT)] for x, y in PLACES]
+NEAR = [_bits(_neighbours(x, y, ((0, 0), *STRAIGHT))) for x, y in PLACES]
+# Every inner place that may become a wall, with the eight around it; and the places of the border.
+INSIDE = [
+    (1 << place, _bits(_neighbours(x, y, STRAIGHT + OBLIQUE)))
+    for place, (x, y) in enumerate(PLACES)
+    if 0 < x < SIDE - 2 and 0 < y < SIDE - 2
+]
+BORDER = [1 << place for place, spot in enumerate(PLACES) if 0 in spot or SIDE - 1 in spot]
+DISTANCES = [[math.sqrt((a - x) ** 2 + (b - y) ** 2) for a, b in PLACES] for x, y in PLACES]
+
+
+class Tape:
+    """What a generator is about to draw, read ahead: a path takes a hundred numbers, and asking for each is slow.
+
+    All bounded integers are made of the generator's 32-bit words, which are drawn here at once. In the end, the
+    generator goes back and draws those that were used.
+    """
+
+    def __init__(self, rng: np.random.Generator, paths: int):
+        self.rng, self.before, self.used = rng, rng.bit_generator.state, 0
+        # A path takes 113 words at most, and one more for every number in ten million, which is drawn again.
+        self.words = rng.integers(0, 1 << 32, 120 * paths, np.uint32).tolist()
+
+    def below(self, limit: int) -> int:
+        """What Generator.integers(0, limit) would draw (Lemire's method)."""
+        if limit == 1:
+            return 0
+        while True:
+            product = self.words[self.used] * limit
+            self.used += 1
+            if (product & 0xFFFFFFFF) >= limit or (product & 0xFFFFFFFF) >= (1 << 32) % limit:
+                return product >> 32
+
+    def dice(self, count: int) -> list[int]:
+        """So many numbers below 100."""
+        products = [word * 100 for word in self.words[self.used : self.used + count]]
+        if min([product & 0xFFFFFFFF for product in products]) < (1 << 32) % 100:
+            return [self.below(100) for _ in range(count)]
+        self.used += count
+        return [product >> 32 for product in products]
+
+    def close(self) -> None:
+        """Leaves the generator as if it had drawn the used words only."""
+        self.rng.bit_generator.state = self.before
+        self.rng.integers(0, 1 << 32, self.used, np.uint32)
+
+
+class Level(NamedTuple):
+    """What the generator decides at a reset, and for every further segment of an endless path."""
+
+    path: list[int]  # its cells, from the origin to the goal
+    walls: list[int]  # the untraceable places of each segment
+
+
+def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
+    """Draws a level in the original's order, so that its seeds mean the same here."""
+    tape = Tape(rng, FIRST_SEGMENTS if variant.endless else 1)
+    if variant.endless:
+        level = draw_segments(tape, tape.below(SIDE), 0, FIRST_SEGMENTS)
+    else:
+        choices = values["cardinal_origin_choice"]
+        side = choices[tape.below(len(choices))]
+        start, end = tape.below(SIDE), tape.below(SIDE)
+        near, far = (0, SIDE - 1) if side in (0, 2) else (SIDE - 1, 0)
+        if side in (0, 1):
+            start, end = near * SIDE + start, far * SIDE + end
+        else:
+            start, end = start * SIDE + near, end * SIDE + far
+        walls = draw_walls(tape, start, end)
+        level = Level([CELLS[place] for place in draw_path(tape, walls, start, end)], [walls])
+    tape.close()
+    return level
+
+
+def draw_segments(tape: Tape, row: int, first: int, count: int) -> Level:
+    """Draws segments of an endless path, from this row on, the first of them being segment number `first`."""
+    path, every_wall = [], []
+    for segment in range(first, first + count):
+        start, end = row, (SIDE - 1) * SIDE + tape.below(SIDE)
+        walls = draw_walls(tape, start, end)
+        shift = segment * SEGMENT * ROWS
+        path += [CELLS[place] + shift for place in draw_path(tape, walls, start, end)]
+        path.append(path[-1] + ROWS)  # the transition tile
+        every_wall.append(walls)
+        row = end % SIDE
+    return Level(path, every_wall)
+
+
+def draw_walls(tape: Tape, start: int, end: int) -> int:
+    """A set of untraceable places: some inside, some on the border that touch neither those nor start and end.
+
+    So there always is a path: along the border, and one ring further inside past the walls that stand there.
+    """
+    walls, kept_free = 0, NEAR[start] | NEAR[end]
+    for (place, around), die in zip(INSIDE, tape.dice(len(INSIDE)), strict=True):
+        if die < 33:
+            walls |= place
+            kept_free |= around
+    free = [place for place in BORDER if not place & kept_free]
+    for _ in range((4, 8)[tape.below(2)]):
+        if free:
+            walls |= free.pop(tape.below(len(free)))
+    return walls
+
+
+def draw_path(tape: Tape, walls: int, start: int, end: int) -> list[int]:
+    """The path that A* finds over random costs, not always the cheapest: its places from start to end."""
+    words, used, closed = tape.words, tape.used, walls
+    cost, total, previous = [0] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
+    distance, opened, here = DISTANCES[end], [start], start
+    while here != end:
+        opened.remove(here)
+        closed |= 1 << here
+        so_far = cost[here] + 1
+        for place, bit in NEIGHBOURS[here]:
+            if closed & bit:
+                continue
+            there = so_far + (words[used] >> 29)  # a cost of 1 to 8
+            used += 1
+            if not cost[place]:
+                cost[place], total[place], previous[place] = there, there + distance[place], here
+                opened.append(place)
+            elif there < cost[place]:
+                # The original leaves the higher cost as it is.
+                previous[place] = here
+        # Not the least total: the first that is less than the first of all, as in the original.
+        least = total[opened[0]]
+        for here in opened:
+            if total[here] < least:
+                break
+        else:
+            here = opened[0]
+    tape.used = used
+    path = [end]
+    while here != start:
+        here = previous[here]
+        path.append(here)
+    return path[::-1]
+
+
+def write_level(s: State, lane: int, level: Level, values: dict[str, Any], variant: Variant) -> None:
+    """Starts the lane's episode at this level."""
+    s.step_at[lane] = PIT
+    s.known[lane] = s.fallen[lane] = s.fresh[lane] = s.restful[lane] = False
+    s.count[lane] = s.segments[lane] = s.furthest[lane] = s.fails[lane] = s.visited[lane] = 0
+    s.length[lane] = s.returned[lane] = 0
+    write_path(s, lane, level, variant)
+    s.fresh[lane, 1] = False
+    radius = radius_of(0.25 if variant.grid else values["agent_scale"])
+    for axis, start in enumerate(divmod(level.path[0] - BEYOND, ROWS)):
+        # Not the tile's middle but for the default size, as in the original.
+        s.pos[lane, axis] = s.origin[lane, axis] = start * TILE + radius + PAD
+        s.tile[lane, axis] = (start * TILE + radius) // TILE
+    s.facing[lane] = 6 if variant.endless else 0
+    s.step[lane], s.at[lane] = NO_STEP, 1  # the first step lands on the origin
+    s.heading[lane] = s.heading_at[lane, 1]
+    s.stamina[lane] = s.stamina_level[lane]
+
+
+def write_path(s: State, lane: int, level: Level, variant: Variant) -> None:
+    """Appends to the lane's path, for which there must be room."""
+    first, segment = int(s.count[lane]) + 1, int(s.segments[lane])
+    last = first + len(level.path)
+    headings = [HEADINGS[there - here] for here, there in pairwise(level.path)]
+    # Behind a transition tile the path goes on to the right. The goal has the direction that leads to it.
+    headings.append(EAST if variant.endless else headings[-1])
+    s.cell[lane, first:last] = level.path
+    s.step_at[lane, level.path] = np.arange(first, last)
+    s.heading_at[lane, first:last] = headings
+    s.fresh[lane, first:last] = s.restful[lane, first:last] = True
+    s.walls[lane, segment : segment + len(level.walls)] = level.walls
+    s.count[lane] = last - 1
+    s.segments[lane] = segment + len(level.walls)
+    if not variant.endless:
+        s.fresh[lane, last - 1] = False  # the goal has a reward of its own
+
+
+# ---- drawing ----
+
+WHITE, GREY, ICE = (255, 255, 255), (210, 210, 210), (125, 177, 250)
+BLUE, GREEN, RED = (0, 0, 255), (0, 255, 0), (255, 0, 0)
+CROSS = 10  # width of the cross
+BAR = 4  # width of the stamina bar
+PAST, STEP, ORIGIN, GOAL, WALL = range(5)  # rows of tiles()
+BACK = np.arange(1, (2 * SIDE - 1) * SIDE + 1)  # steps back that can be drawn: those on less than two segments
+
+
+@cache
+def tile_picture(inner: tuple[int, int, int], border: tuple[int, int, int]) -> np.ndarray:
+    """(TILE, TILE, 3) uint8, read-only: a tile with a border of one pixel."""
+    picture = np.tile(np.array(border, np.uint8), (TILE, TILE, 1))
+    picture[1:-1, 1:-1] = inner
+    picture.flags.writeable = False
+    return picture
+
+
+@cache
+def tiles() -> Sheet:
+    """Every kind of tile, to be pasted where a part of it may be off the screen."""
+    colors = [(WHITE, GREY), (WHITE, WHITE), (BLUE, BLUE), (GREEN, GREEN), (RED, RED)]
+    pictures = np.stack([tile_picture(*color) for color in colors])
+    return make_sheet(pictures, np.ones(pictures.shape[:3], bool), np.arange(SPAN) - PAD)
+
+
+@cache
+def crosses() -> Sheet:
+    """The red cross: two diagonals, three pixels wide."""
+    rows, columns = np.indices((CROSS, CROSS))
+    mask = (abs(rows - columns) <= 1) | (abs(rows + columns - CROSS + 1) <= 1)
+    picture = np.tile(np.array(RED, np.uint8), (CROSS, CROSS, 1))
+    return make_sheet(picture[None], mask[None], np.arange(SPAN) - PAD)
+
+
+@cache
+def grounds() -> np.ndarray:
+    """(1 + TILE, FRAME) uint8, read-only: black, then the tiled background moved left by 0, 1, 2, ... pixels."""
+    ice = np.tile(tile_picture(ICE, GREY), (SIDE, SIDE + 1, 1))
+    pictures = [np.zeros((SCREEN, SCREEN, 3), np.uint8), *(ice[:, shift : shift + SCREEN] for shift in range(TILE))]
+    table = np.stack(pictures).reshape(-1, FRAME)
+    table.flags.writeable = False
+    return table
+
+
+@cache
+def bars() -> np.ndarray:
+    """(SCREEN + 1, SCREEN, 3 * BAR) uint8, read-only: the stamina bar, green below so many red rows."""
+    table = np.tile(np.array(GREEN, np.uint8), (SCREEN + 1, SCREEN, BAR, 1))
+    table[np.arange(SCREEN + 1)[:, None] > np.arange(SCREEN)] = RED
+    table = table.reshape(SCREEN + 1, SCREEN, 3 * BAR)
+    table.flags.writeable = False
+    return table
+
+
+def draw(s: State, sheet: Sheet, lanes: np.ndarray | slice, endless: bool) -> np.ndarray:
+    """Fresh frames of the lanes, (n, 84, 84, 3) uint8, from the state alone."""
+    frames = draw_endless_ground(s, lanes) if endless else draw_ground(s, lanes)  # (n, FRAME)
+    draw_agent(frames, s, sheet, lanes, endless)
+    return frames.reshape(-1, SCREEN, SCREEN, 3)
+
+
+def draw_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+    """Black (n, FRAME), with the path's origin and goal where they are shown."""
+    frames = np.zeros((len(s.at[lanes]), FRAME), np.uint8)
+    if not np.count_nonzero(s.extras[lanes]):
+        return frames
+    for shown, kind in ((s.show_origin[lanes], ORIGIN), (s.show_goal[lanes], GOAL)):
+        if np.count_nonzero(shown):
+            (which,) = shown.nonzero()
+            step = s.count[lanes][which] if kind == GOAL else 1
+            cell = s.cell[lanes][which, step]
+            paste(frames, tiles(), np.full(len(which), kind), tile_centres(cell), which)
+    return frames
+
+
+def tile_centres(cell: np.ndarray) -> np.ndarray:
+    """(n, 2) the middles of the cells' tiles, with PAD."""
+    return np.stack([cell // ROWS, cell % ROWS - BEYOND], axis=1) * TILE + TILE // 2 + PAD
+
+
+def draw_endless_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+    """(n, FRAME): black or the background, and the path behind the agent where it is shown."""
+    column, walked = s.tile[lanes, 0], s.pos[lanes, 0] - s.origin[lanes, 0]
+    if np.count_nonzero(s.extras[lanes]):
+        # Starts again as soon as it has moved by a tile or more, which jumps if the speed does not divide that.
+        frames = grounds().take((walked % s.lap[lanes] + 1) * s.show_ground[lanes], axis=0)
+    else:
+        frames = np.zeros((len(column), FRAME), np.uint8)
+    (which,) = ((np.minimum(column, s.at[lanes] - 1) > 0) & s.show_past[lanes]).nonzero()
+    if which.size:
+        owner, cell = trail(s, which if isinstance(lanes, slice) else lanes[which])
+        draw_trail(frames, which[owner], cell, walked - s.camera[lanes])
+    return frames
+
+
+def trail(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The path behind the agents: for each tile, (m,), which of the lanes it belongs to, and its cell.
+
+    From the last step but one backwards, up to the first that is as far to the left as the camera's offset in tiles.
+    """
+    at = s.at[lanes]
+    bound = np.maximum(s.tile[lanes, 0] - s.depth[lanes], 1) * ROWS  # (n,) cells below that are far enough left
+    back = BACK[: int(at.max())]  # (K,)
+    steps = at[:, None] - back  # (n, K)
+    np.maximum(steps, PIT, out=steps)
+    cells = s.cell.take(steps + lanes[:, None] * s.cell.shape[1])  # (n, K)
+    # At the latest, a trail ends at the pit, whose cell is left of everything.
+    last = (cells < bound[:, None]).argmax(axis=1)  # (n,)
+    owner, which = np.nonzero((back <= last[:, None] + 1) & (cells != NOWHERE))
+    return owner, cells[owner, which]
+
+
+def draw_trail(frames: np.ndarray, owner: np.ndarray, cell: np.ndarray, camera: np.ndarray) -> None:
+    """Draws the cells' tiles on their owners' frames, in place. camera: (n,) the screen's left edge on the path."""
+    column, row = np.divmod(cell, ROWS)
+    # A camera between two pixels cuts the fraction off, towards zero.
+    x, y = (column * TILE - camera[owner]).astype(np.int64), (row - BEYOND) * TILE
+    whole = (x >= 0) & (x <= SCREEN - TILE)
+    if np.count_nonzero(whole) < len(whole):
+        cut = ~whole & (x > -TILE) & (x < SCREEN)
+        centres = np.stack([x[cut], y[cut]], axis=1) + TILE // 2 + PAD
+        # Before the whole tiles, which then cover what the cut ones' squares have of them.
+        paste(frames, tiles(), np.full(len(centres), PAST), centres, owner[cut])
+        owner, x, y = owner[whole], x[whole], y[whole]
+    stamp(frames, tile_picture(WHITE, GREY), owner, x, y)
+
+
+def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: np.ndarray | slice, endless: bool) -> None:
+    """Draws the agents, their stamina and their crosses on the frames (n, FRAME), in place."""
+    pos = s.pos[lanes]
+    if endless:
+        pos = np.maximum(pos, 0)
+        np.minimum(pos, SPAN - 1, out=pos)  # off the screen
+        pos[:, 0] = s.figure_x[lanes]
+    paste(frames, sheet, s.figure[lanes] * FACINGS + s.facing[lanes], pos)
+    if np.count_nonzero(s.extras[lanes]):
+        shown = s.show_stamina[lanes]
+        spent = (SCREEN * (1 - s.stamina[lanes] / s.stamina_level[lanes])).astype(np.int64)  # (n,) pixels
+        frames.reshape(-1, SCREEN, ROW)[shown, :, -3 * BAR :] = bars()[spent[shown]]
+    (which,) = (s.fallen[lanes] & s.feedback[lanes]).nonzero()
+    if which.size:
+        cross = pos[which]
+        if endless:
+            cross[:, 0] = s.cross_x[lanes][which]
+        paste(frames, crosses(), np.zeros_like(which), cross, which)
+
+
+# ---- rules ----
+
+# The endless id's actions: 0 nothing, 1 right, 2 up, 3 down.
+ENDLESS_MOVES = np.array([(0, 0), (1, 0), (0, -1), (0, 1)])  # (4, 2)
+ENDLESS_TURN = np.array([(facing, 6, 0, 4) for facing in range(FACINGS)])  # (8, 4) the next facing
+
+
+def land(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: bool) -> None:
+    """What happens on another tile, or in the pit. Where the agent has not moved on, this changes nothing.
+
+    lane_path: (N,) where the lane's steps start in the flattened path. rewards: (N,), changed in place.
+    """
+    s.at = np.where(s.fallen, s.at, s.step)
+    here = s.step + lane_path
+    fresh = s.fresh.take(here)
+    if np.count_nonzero(fresh):
+        rewards += fresh * s.reward_progress
+        s.visited += fresh
+        s.fresh.put(here, False)
+    if np.count_nonzero(s.fallen):
+        rewards += s.fallen * s.reward_fall_off
+        s.fails += s.fallen
+    heading = s.heading_at.take(s.at + lane_path)
+    # The endless id's ground truth has no entry for the west.
+    s.heading = np.where(heading == WEST, s.heading, heading) if endless else heading
+
+
+def rest(s: State, lane_path: np.ndarray) -> None:
+    """The endless id: gives stamina back on a tile for the first time since the last fall. So does the origin."""
+    here = s.step + lane_path
+    np.copyto(s.stamina, s.stamina_level, where=s.restful.take(here))
+    s.restful.put(here, False)
+
+
+def fall(s: State, cell: np.ndarray) -> np.ndarray:
+    """The endless id: gives stamina back to those in the pit; (N,) bool whose fall ends the episode.
+
+    cell: (N,) the agents' places in the flattened map.
+    """
+    over = s.fallen & ((s.tile[:, 0] < s.furthest) | s.known.take(cell))
+    # Never forgotten: the original means to, on progress, but compares before there can be any.
+    s.known.put(cell[s.fallen], True)
+    s.restful[s.fallen, 1:] = True
+    np.copyto(s.stamina, s.stamina_level, where=s.fallen)
+    return over
+
+
+class MysteryPath(MemoryGymVectorEnv):
+    """Mystery Path (thesis 4.4; memory-gym 1.0.2), N lanes at once.
+
+    A path leads over a grid of 7 x 7 tiles, from a random tile of one side to one of the opposite side. Neither is
+    seen. An agent that steps off the path falls into a pit, which a red cross shows, and is back at the path's origin
+    at the next step, whatever its action.
+
+    Variants:
+        MysteryPath-v0: free movement. MysteryPath-Grid-v0: tile by tile.
+        Endless-MysteryPath-v0: the path goes on to the right for ever, in segments of 7 columns and a transition tile.
+            The camera moves with the agent, which sees the path behind it but cannot walk left.
+
+    Actions: MultiDiscrete([3, 3]): horizontal (0 none, 1 left, 2 right) and vertical (0 none, 1 up, 2 down). Grid id
+        Discrete(4): 0 nothing, 1 turn left, 2 turn right, 3 one tile forward. Endless id Discrete(4): 0 nothing,
+        1 right, 2 up, 3 down.
+    Observation: Box (84, 84, 3) uint8, rows first.
+    Rewards: `reward_goal` (1) at the goal, `reward_path_progress` (0.1, Grid 0) for every other tile but the origin
+        when it is reached for the first time, `reward_fall_off` (0) in the pit, and `reward_step` (0) at every step.
+    Episode end: terminated at the goal. The endless id: terminated when no new tile was reached for `stamina_level`
+        (20) steps (all tiles are new again after a fall), by falling off in a column left of the best progress, and by
+        falling off at the same place again. Truncated after `max_steps` steps (512, Grid 128, endless no limit; a real
+        end at that very step counts as termination).
+    Options: `VARIANTS[id].options`. Those marked * are lists, one entry of which is drawn at every reset.
+    Ground truth: one-hot, the direction of the path's next tile from where the agent last was on the path: east, north,
+        south, west, (4,); at the goal, the direction that leads to it. Endless id: east, north, south, (3,); where the
+        path goes west, the direction before.
+    Final info: `reward`, `length`, `num_fails` and `success`; in the endless id `max_x`, the rightmost column of the
+        path that was reached, and `tiles_visited`, instead of success.
+
+    Kept from the original: the agent starts as far from its tile's top left corner as its radius, so one of scale 0.48
+        or more starts beside the origin; grid ids ignore agent_scale, the endless id show_origin; in the endless id the
+        camera's fraction of a pixel is cut off, the background jumps at speeds that do not divide 12, no place of a
+        fall is ever forgotten, and only the first tile of the leftmost column that is shown of the past path is drawn,
+        none while the agent is in the first column. Where the endless path goes left, nobody can follow it. Steps are
+        cut off to whole pixels, a diagonal one to 2 pixels at the default speed.
+    Differences from the original: images are rows first; max_steps truncates; every id reports ground truth; wrong
+        options raise ValueError.
+    """
+
+    variants = VARIANTS
+
+    def spaces(self) -> tuple[gym.Space, gym.Space]:
+        """The observation and the action space of one lane."""
+        free = not (self.variant.grid or self.variant.endless)
+        actions = gym.spaces.MultiDiscrete([3, 3]) if free else gym.spaces.Discrete(4)
+        return gym.spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8), actions
+
+    def allocate(self) -> None:
+        """Makes the state of N lanes."""
+        self.state = empty_state(self.num_envs, FIRST_SEGMENTS + 1 if self.variant.endless else 1)
+        self.figures = (self._figure(self.defaults),)  # all that differ, of all lanes
+        self._place_tables()
+
+    def configure(self, lanes: np.ndarray) -> None:
+        """Takes over the options of the lanes, and the tables that all lanes' options need."""
+        s, values = self.state, self.settings[int(lanes[0])]
+        s.limit[lanes] = NO_LIMIT if values["max_steps"] == -1 else values["max_steps"]
+        s.feedback[lanes] = values["visual_feedback"]
+        for what, option in SHOWN.items():
+            getattr(s, f"show_{what}")[lanes] = values.get(option, False)
+        s.extras[lanes] = any(values.get(option, False) for what, option in SHOWN.items() if what != "past")
+        s.reward_goal[lanes] = values.get("reward_goal", 0.0)
+        s.reward_fall_off[lanes] = values["reward_fall_off"]
+        s.reward_progress[lanes] = values["reward_path_progress"]
+        s.reward_step[lanes] = values["reward_step"]
+        s.stamina_level[lanes] = values.get("stamina_level", 1)
+        if self.variant.endless:
+            self._place_camera(lanes, values)
+        every = [self._figure(each) for each in self.settings]
+        self.figures = tuple(dict.fromkeys(every))
+        s.figure[:] = [self.figures.index(figure) for figure in every]
+        self._place_tables()
+
+    def _place_camera(self, lanes: np.ndarray, values: dict[str, Any]) -> None:
+        s, scale, speed = self.state, values["agent_scale"], int(values["agent_speed"])
+        camera = TILE * values["camera_offset_scale"]
+        s.camera[lanes], s.depth[lanes], s.speed[lanes] = camera, int(values["camera_offset_scale"]), speed
+        s.lap[lanes] = speed * math.ceil(TILE / speed) if speed else 1
+        # The original cuts the fraction off at the corner of the agent's sprite, and rounds the cross's middle.
+        radius, corner = radius_of(scale), (2 * radius_of(scale) + int(10 * scale) + 14) // 2
+        s.figure_x[lanes] = corner + int(radius - corner + camera) + PAD
+        s.cross_x[lanes] = math.floor(radius + camera + 0.5) + PAD
+
+    def _figure(self, values: dict[str, Any]) -> Figure:
+        if self.variant.grid:
+            return Figure(0.25, TILE, 0, SCREEN, TILE // 2, False)
+        scale = values["agent_scale"]
+        return Figure(scale, values["agent_speed"], 0, SCREEN, radius_of(scale), False)
+
+    def _place_tables(self) -> None:
+        """The flat tables that step() looks things up in, and where each lane's rows start in them."""
+        self._wardrobe = wardrobe(self.figures)
+        self._controls = grid_controls() if self.variant.grid else free_controls()
+        self._truths = np.eye(4)[:, : 3 if self.variant.endless else 4].copy()
+        self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
+        self._lane_map = np.arange(self.num_envs) * self.state.step_at.shape[1] + BEYOND  # (N,)
+        self._lane_path = np.arange(self.num_envs) * self.state.cell.shape[1]  # (N,)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The tables are large and follow from the options.
+        return {name: value for name, value in self.__dict__.items() if name != "_wardrobe"}
+
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        self.__dict__.update(values)
+        self._place_tables()
+
+    def begin(self, lane: int, rng: np.random.Generator) -> None:
+        """Draws the lane's next level and starts its episode."""
+        level = draw_level(rng, self.settings[lane], self.variant)
+        if make_room(self.state, len(level.path), len(level.walls)):
+            self._place_tables()
+        write_level(self.state, lane, level, self.settings[lane], self.variant)
+
+    def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """One step of the rules: walk, land on a tile, end or fall."""
+        s, endless = self.state, self.variant.endless
+        s.length += 1
+        self._move(actions)
+        s.tile = (s.pos - PAD) // TILE  # (N, 2)
+        if endless:
+            self._lengthen()
+        cell = s.tile.dot(MAP_STRIDES) + self._lane_map  # (N,)
+        before, s.step = s.step, s.step_at.take(cell)
+        s.fallen = s.step == PIT
+        rewards = s.reward_step.copy()
+        landed = np.count_nonzero(s.step != before)
+        if landed:
+            land(s, self._lane_path, rewards, endless)
+        terminated = self._tire(cell, landed) if endless else s.step == s.count
+        if not endless and np.count_nonzero(terminated):
+            rewards += terminated * s.reward_goal
+        s.returned += rewards
+        truncated = s.length == s.limit
+        if np.count_nonzero(truncated):
+            truncated &= ~terminated
+        return rewards, terminated, truncated
+
+    def _tire(self, cell: np.ndarray, landed: int) -> np.ndarray:
+        """The endless id: who has no stamina left, or fell off where it must not; (N,) bool."""
+        s = self.state
+        if not landed:
+            s.stamina -= 1
+            return s.stamina == 0
+        rest(s, self._lane_path)
+        over = fall(s, cell) if np.count_nonzero(s.fallen) else False
+        s.furthest = np.where(s.fallen, s.furthest, np.maximum(s.furthest, s.tile[:, 0]))
+        s.stamina -= 1
+        return (s.stamina == 0) | over
+
+    def _move(self, actions: np.ndarray) -> None:
+        """Walks, or puts those who fell back to the origin."""
+        s, endless = self.state, self.variant.endless
+        action = actions if actions.ndim == 1 else actions.dot(BRANCHES)  # (N,)
+        if np.count_nonzero(s.fallen):
+            action = np.where(s.fallen, 0, action)
+            s.pos = np.where(s.fallen[:, None], s.origin, s.pos)
+            s.step[s.fallen] = NO_STEP  # what it lands on is another tile, even if that is the pit again
+        if endless:
+            s.facing = ENDLESS_TURN.take(s.facing * len(ENDLESS_MOVES) + action)
+            s.pos = s.pos + ENDLESS_MOVES.take(action, axis=0) * s.speed
+        else:
+            s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._wardrobe.walk)
+
+    def _lengthen(self) -> None:
+        """Appends a segment to the paths whose last one was just entered."""
+        s = self.state
+        entered = s.tile[:, 0] >= (s.segments - 1) * SEGMENT
+        if not np.count_nonzero(entered):
+            return
+        for lane in np.flatnonzero(entered).tolist():
+            steps, segments = int(s.count[lane]), int(s.segments[lane])
+            row = int(s.cell[lane, steps]) % ROWS - BEYOND
+            tape = Tape(self._rngs[lane], 1)
+            level = draw_segments(tape, row, segments, 1)
+            tape.close()
+            if make_room(s, steps + len(level.path), segments + 1):
+                self._place_tables()
+            write_path(s, lane, level, self.variant)
+
+    def observe(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh observations of the lanes."""
+        return self.frames(lanes)
+
+    def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh frames of the lanes, (n, 84, 84, 3)."""
+        return draw(self.state, self._wardrobe.sheet, lanes, self.variant.endless)
+
+    def ground_truth(self) -> np.ndarray:
+        """A fresh (N, 4), endless (N, 3): the direction of the path's next tile."""
+        return self._truths.take(self.state.heading, axis=0)
+
+    def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
+        """The lanes' ended episodes in numbers."""
+        s = self.state
+        numbers = {"reward": s.returned[lanes], "length": s.length[lanes]}
+        if self.variant.endless:
+            places = {"max_x": s.furthest[lanes], "tiles_visited": s.visited[lanes]}
+            return numbers | {"num_fails": s.fails[lanes]} | places
+        success = (s.step[lanes] == s.count[lanes]).astype(np.int64)
+        return numbers | {"success": success, "num_fails": s.fails[lanes]}
+
+    def annotate(self, frame: np.ndarray, lane: int) -> None:
+        """Draws the path in white, its origin blue, its goal green and the walls red, then the agent over them."""
+        s, one, endless = self.state, np.array([lane]), self.variant.endless
+        small = draw_endless_ground(s, one) if endless else draw_ground(s, one)  # (1, FRAME)
+        steps = int(s.count[lane])
+        marks = [(cell, STEP) for cell in s.cell[lane, 1 : steps + 1].tolist()]
+        marks[0] = (marks[0][0], ORIGIN)
+        if not endless:
+            marks[-1] = (marks[-1][0], GOAL)
+        for segment, walls in enumerate(s.walls[lane, : s.segments[lane]].tolist()):
+            shift = segment * SEGMENT * ROWS
+            marks += [(CELLS[place] + shift, WALL) for place in range(SIDE * SIDE) if walls >> place & 1]
+        camera = int(s.pos[lane, 0] - s.origin[lane, 0] - s.camera[lane]) if endless else 0
+        for cell, kind in marks:
+            centre = tile_centres(np.array([cell])) - (camera, 0)
+            if PAD - TILE // 2 < centre[0, 0] < PAD + SCREEN + TILE // 2:
+                paste(small, tiles(), np.array([kind]), centre)
+        draw_agent(small, s, self._wardrobe.sheet, one, endless)
+        frame[:] = magnify(small.reshape(SCREEN, SCREEN, 3), DEBUG_ZOOM)
