@@ -29,6 +29,8 @@ ORIGINALS = {
     "MortarMayhemB-v0": ("mortar_mayhem_b", "MortarMayhemTaskBEnv"),
     "MortarMayhemB-Grid-v0": ("mortar_mayhem_b_grid", "GridMortarMayhemTaskBEnv"),
     "Endless-MortarMayhem-v0": ("endless_mortar_mayhem", "EndlessMortarMayhemEnv"),
+    "SearingSpotlights-v0": ("searing_spotlights", "SearingSpotlightsEnv"),
+    "Endless-SearingSpotlights-v0": ("endless_searing_spotlights", "EndlessSearingSpotlightsEnv"),
 }
 COLUMNS = ["id", "memory-gym", "one", "ratio", "{n} lanes", "ratio", "reset, memory-gym", "reset", "ratio"]
 ACTIONS = 256  # sampled before the clock starts

@@ -26,7 +26,16 @@ def disk(size: int, x: float, y: float, radius: int) -> np.ndarray:
 
 def ring(size: int, x: float, y: float, radius: int, width: int) -> np.ndarray:
     """A circle of the given line width on a (size, size) mask."""
-    return disk(size, x, y, radius) & ~disk(size, x, y, radius - width)
+    solid = disk(size, x, y, radius)
+    if width > 1:
+        return solid & ~disk(size, x, y, radius - width)
+    # A thin line is walked octant by octant: the outermost pixel of each column, and beside the diagonals of each row.
+    columns, rows = np.arange(size) + 0.5 - x, (np.arange(size) + 0.5 - y)[:, None]
+    around = np.pad(solid, 1)
+    above = np.where(rows < 0, around[:-2, 1:-1], around[2:, 1:-1])  # the next pixel away from the centre
+    aside = np.where(columns < 0, around[1:-1, :-2], around[1:-1, 2:])
+    steep = np.abs(columns) - np.abs(rows)
+    return solid & ((~above & (steep <= 0)) | (~aside & (steep >= 0)))
 
 
 def turned_45(mask: np.ndarray, size: int) -> np.ndarray:
@@ -86,13 +95,15 @@ def make_sheet(sprites: np.ndarray, solid: np.ndarray, positions: np.ndarray) ->
     )
 
 
-def paste(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray) -> None:
-    """Pastes sprite rows[i] of the sheet into frames[i], centred at pos[i].
+def paste(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, at: np.ndarray | None = None) -> None:
+    """Pastes sprite rows[i] of the sheet into frames[i], or into frames[at[i]], centred at pos[i].
 
     frames: (n, FRAME) uint8, contiguous, changed in place. rows: (n,). pos: (n, 2), x and y, indices of positions.
+    at: different frames; None: all of them.
     """
     place = pos[:, 1] * sheet.positions + pos[:, 0]  # (n,)
-    start = sheet.frame_start.take(place) + np.arange(0, len(frames) * SCREEN * SCREEN, SCREEN * SCREEN)
+    first = np.arange(0, len(frames) * SCREEN * SCREEN, SCREEN * SCREEN) if at is None else at * (SCREEN * SCREEN)
+    start = sheet.frame_start.take(place) + first
     source = sheet.canvas_start.take(place) + rows * (sheet.canvas * sheet.canvas)
     squares = windows(frames, SCREEN, sheet.row)  # a square never leaves its frame, as frame_start is clipped
     patch = squares[start]  # (n, W) rows

@@ -14,13 +14,26 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from players import player
+from players import FAMILY, choices, player
 
 import memory_gym_envs
-from memory_gym_envs import IDS, MortarMayhem, options_table
+from memory_gym_envs import IDS, MortarMayhem, SearingSpotlights, options_table
 
 EACH = pytest.mark.parametrize("env_id", IDS)
+MORTAR = pytest.mark.parametrize("env_id", MortarMayhem.variants)
+SPOTLIGHTS = pytest.mark.parametrize("env_id", SearingSpotlights.variants)
 LANES = 4
+
+# Options by family: short episodes that end with a reward of -1, where the state shows them, and what it is by default.
+QUICK = {
+    MortarMayhem: {"explosion_delay": [2], "explosion_duration": (1,), "reward_command_failure": -1},
+    SearingSpotlights: {"agent_health": 1, "initial_spawns": 20, "reward_death": -1},
+}
+SHOWN = {
+    MortarMayhem: lambda s: s.fuse.tolist() == [2] * LANES,
+    SearingSpotlights: lambda s: s.full.tolist() == [1.0] * LANES,
+}
+METRIC = {MortarMayhem: "commands_completed", SearingSpotlights: "coins_collected"}
 
 
 def make(env_id, **arguments):
@@ -34,8 +47,7 @@ def picture(observation):
 def roll(envs, steps, seed=0):
     """Everything that some steps of random actions return."""
     rng = np.random.default_rng(seed)
-    high = 4 if envs.variant.grid else 3
-    return [envs.step(rng.integers(0, high, envs.action_space.shape)) for _ in range(steps)]
+    return [envs.step(rng.integers(0, choices(envs), envs.action_space.shape)) for _ in range(steps)]
 
 
 # ---- Gymnasium's own checks ----
@@ -89,7 +101,7 @@ def test_infos_are_those_of_sync_vector_env(env_id):
     for _ in range(200):
         actions = player(ours)
         stumble = rng.random(LANES) < (0.0, 0.3, 0.6, 1.0)
-        wrong = rng.integers(0, 4 if ours.variant.grid else 3, actions.shape)
+        wrong = rng.integers(0, choices(ours), actions.shape)
         actions = np.where(stumble.reshape(-1, *[1] * (actions.ndim - 1)), wrong, actions)
         left, right = ours.step(actions), theirs.step(actions)
         for ours_part, theirs_part in zip(left[:4], right[:4], strict=True):
@@ -180,7 +192,7 @@ def test_levels(env_id):
     automatic.reset()
     for *_, infos in roll(automatic, 130):
         assert set(automatic.np_random_seed) <= {100, 101}
-        assert infos["ground_truth"].shape == (2, 2)
+        assert infos["ground_truth"].shape == (2, len(next(iter(truth))))
 
 
 def test_unseeded_levels_differ():
@@ -200,22 +212,22 @@ def test_unseeded_levels_differ():
 
 @EACH
 def test_options_stay_until_the_next_explicit_reset(env_id):
-    envs = make(env_id)
-    options = {"explosion_delay": [2], "explosion_duration": (1,), "reward_command_failure": -1}
-    envs.reset(seed=0, options=options)
+    envs, family = make(env_id), FAMILY[env_id]
+    envs.reset(seed=0, options=QUICK[family])
     steps = roll(envs, 200)
     assert sum(step[2].sum() for step in steps) > LANES  # several episodes a lane
     assert {r for step in steps for r, over in zip(step[1], step[2], strict=True) if over and r < 0} == {-1.0}
-    assert envs.state.fuse.tolist() == [2] * LANES
+    assert SHOWN[family](envs.state)
     envs.reset()
-    assert envs.state.fuse.tolist() == [6 if envs.variant.grid else 18] * LANES
+    assert not SHOWN[family](envs.state)
+    assert envs.settings == [envs.defaults] * LANES
 
 
 @EACH
 def test_every_option_in_its_range(env_id):
     """Random settings of all options at once: no exception, nothing outside the spaces."""
     rng = np.random.default_rng(0)
-    specs = MortarMayhem.variants[env_id].options
+    specs = FAMILY[env_id].variants[env_id].options
     envs = make(env_id)
     for _ in range(25):
         options = {option.name: json.loads(json.dumps(random_value(option, rng))) for option in specs}
@@ -223,7 +235,8 @@ def test_every_option_in_its_range(env_id):
         assert observations in envs.observation_space
         for observations, rewards, _, _, infos in roll(envs, 40):  # noqa: B007 - the last is used
             assert np.isfinite(rewards).all()
-            assert ((infos["ground_truth"] >= 0) & (infos["ground_truth"] <= 1)).all()
+            # A Searing Spotlights agent may start up to two pixels outside the screen.
+            assert ((infos["ground_truth"] >= 0) & (infos["ground_truth"] <= 86 / 84)).all()
         assert observations in envs.observation_space
 
 
@@ -235,11 +248,12 @@ def random_value(option, rng):
     if option.kind == "float":
         return float(rng.choice([low, high, rng.uniform(low, high)]))
     small = min(high, low + 12)
-    values = [int(rng.choice([low, rng.integers(low, small + 1)])) for _ in range(rng.integers(1, 4))]
+    shortest = 0 if option.empty else 1
+    values = [int(rng.choice([low, rng.integers(low, small + 1)])) for _ in range(rng.integers(shortest, 4))]
     return values if option.kind == "ints" else int(rng.choice([low, high if high <= 9 else small]))
 
 
-WRONG = [
+WRONG_MORTAR = [
     ({"arena_sise": 3}, "'arena_sise'.*'(arena|agent)_"),
     ({"explosion_dellay": [3]}, "'explosion_dellay'.*'explosion_delay'.*a list of integers from 1 to 1000"),
     ({"explosion_delay": 18}, "'explosion_delay'.*a list of integers from 1 to 1000.*18"),
@@ -260,10 +274,28 @@ WRONG = [
     ({7: 1}, "7"),
     ([("agent_scale", 1)], "options must be a dictionary"),
 ]
+WRONG_SPOTLIGHTS = [
+    ({"agent_helth": 3}, "'agent_helth'.*'agent_health'.*an integer of at least 1"),
+    ({"agent_health": 0}, "'agent_health'.*an integer of at least 1.*0"),
+    ({"initial_spawns": 101}, "'initial_spawns'.*an integer from 0 to 100.*101"),
+    ({"spot_min_radius": 0.9}, "'spot_min_radius'.*a number from 1 to 42"),
+    ({"spot_max_speed": 1.01}, "'spot_max_speed'"),
+    ({"spot_damage": -1}, "'spot_damage'"),
+    ({"light_threshold": 256}, "'light_threshold'.*an integer from 0 to 255"),
+    ({"black_background": 1}, "'black_background'.*true or false"),
+    ({"coin_scale": 0.0}, "'coin_scale'.*a number from 0.1 to 2.0"),
+    ({"max_steps": 0}, "'max_steps'.*-1 or an integer of at least 1"),
+    ({"agent_speed": [3.0]}, "'agent_speed'"),
+    ({7: 1}, "7"),
+    ([("agent_scale", 1)], "options must be a dictionary"),
+]
+WRONG = [
+    *((env_id, *each) for env_id in MortarMayhem.variants for each in WRONG_MORTAR),
+    *((env_id, *each) for env_id in SearingSpotlights.variants for each in WRONG_SPOTLIGHTS),
+]
 
 
-@EACH
-@pytest.mark.parametrize(("options", "message"), WRONG, ids=[str(w[0])[:40] for w in WRONG])
+@pytest.mark.parametrize(("env_id", "options", "message"), WRONG, ids=[f"{w[0]}-{w[1]}"[:60] for w in WRONG])
 def test_wrong_option_changes_nothing(env_id, options, message):
     envs, env = make(env_id), gym.make(env_id)
     envs.reset(seed=0)
@@ -291,6 +323,14 @@ def test_wrong_option_changes_nothing(env_id, options, message):
         ("Endless-MortarMayhem-v0", {"arena_size": 5}),
         ("Endless-MortarMayhem-v0", {"max_steps": 0}),
         ("Endless-MortarMayhem-v0", {"initial_command_count": 0}),
+        ("SearingSpotlights-v0", {"steps_per_coin": 160}),
+        ("SearingSpotlights-v0", {"num_coins": [21]}),
+        ("SearingSpotlights-v0", {"num_coins": 1}),
+        ("SearingSpotlights-v0", {"coin_enabled": False}),
+        ("Endless-SearingSpotlights-v0", {"num_coins": [1]}),
+        ("Endless-SearingSpotlights-v0", {"use_exit": False}),
+        ("Endless-SearingSpotlights-v0", {"spawn_interval": 0}),
+        ("Endless-SearingSpotlights-v0", {"steps_per_coin": 0}),
     ],
 )
 def test_options_of_one_id_alone(env_id, options):
@@ -300,8 +340,9 @@ def test_options_of_one_id_alone(env_id, options):
 
 @EACH
 def test_options_table(env_id):
-    table = options_table(MortarMayhem.variants[env_id].options)
-    for option in MortarMayhem.variants[env_id].options:
+    options = FAMILY[env_id].variants[env_id].options
+    table = options_table(options)
+    for option in options:
         assert f"| `{option.name}` | `{json.dumps(option.default)}` | {option.allowed} |" in table
         assert option.parse(option.default) == option.default
 
@@ -320,12 +361,12 @@ def test_options_table(env_id):
         ({"start_level": "a"}, "start_level"),
         ({"num_envs": 0}, "num_envs"),
         ({"num_envs": 2.0}, "num_envs"),
-        ({"variant": "MortarMayhem-v9"}, "MortarMayhem-v0, .*MortarMayhem-v9"),
+        ({"variant": "Nothing-v9"}, "-v0, .*Nothing-v9"),
     ],
 )
 def test_wrong_arguments(env_id, arguments, message):
     with pytest.raises(ValueError, match=message):
-        MortarMayhem(**{"variant": env_id, **arguments})
+        FAMILY[env_id](**{"variant": env_id, **arguments})
 
 
 @EACH
@@ -384,11 +425,11 @@ def test_reset_needed(env_id):
             each.step(each.action_space.sample())
     with pytest.raises(gym.error.ResetNeeded):
         envs.render()
-    env.reset(seed=0, options={"explosion_delay": [1], "reward_command_failure": -1.0})
+    env.reset(seed=0, options=QUICK[FAMILY[env_id]])
     over = False
     while not over:
         *_, over, _, info = env.step(env.action_space.sample())
-    assert set(info) > {"reward", "length", "commands_completed", "ground_truth"}
+    assert set(info) > {"reward", "length", METRIC[FAMILY[env_id]], "ground_truth"}
     with pytest.raises(gym.error.ResetNeeded):
         env.step(env.action_space.sample())
     env.reset()
@@ -403,7 +444,7 @@ def test_reset_needed(env_id):
 @pytest.mark.parametrize("num_levels", [None, 5])
 def test_copies_have_the_same_future(env_id, clone, num_levels):
     envs = make(env_id, num_levels=num_levels)
-    envs.reset(seed=1, options={"explosion_delay": [3], "agent_scale": 0.3})
+    envs.reset(seed=1, options={**QUICK[FAMILY[env_id]], "agent_scale": 0.3})
     roll(envs, 70)
     twin = clone(envs)
     for left, right in zip(roll(envs, 100, seed=2), roll(twin, 100, seed=2), strict=True):
@@ -443,7 +484,7 @@ def test_returned_arrays_are_the_callers(env_id):
 def roll_and_spoil(envs, steps):
     rng = np.random.default_rng(0)
     for _ in range(steps):
-        result = envs.step(rng.integers(0, 4 if envs.variant.grid else 3, envs.action_space.shape))
+        result = envs.step(rng.integers(0, choices(envs), envs.action_space.shape))
         yield copy.deepcopy(result)
         spoil(result)
 
@@ -466,7 +507,7 @@ def spoil(part):
 def test_a_frame_depends_on_this_episode_alone(env_id):
     """The original shows the last episode's agent until the new one moves."""
     env, fresh = gym.make(env_id), gym.make(env_id)
-    env.reset(seed=1, options={"explosion_delay": [3]})
+    env.reset(seed=1, options=QUICK[FAMILY[env_id]])
     over = False
     while not over:
         *_, over, _, _ = env.step(3 if "Grid" in env_id else [2, 2])
@@ -493,7 +534,7 @@ def test_render(env_id):
         assert np.array_equal(np.stack(frames), picture(observations))
 
 
-@EACH
+@MORTAR
 def test_debug_render_circles_the_target(env_id):
     env = gym.make(env_id, render_mode="debug_rgb_array").unwrapped
     observation, info = env.reset(seed=2)
@@ -551,6 +592,68 @@ def test_visual_feedback():
         assert seen == (12 if feedback else 0)  # two fires of six steps
 
 
+@SPOTLIGHTS
+def test_debug_render_lights_everything(env_id):
+    """Floor, agent, coin and exit show in the dark; green circles are where the agent's view is lit."""
+    env = gym.make(env_id, render_mode="debug_rgb_array").unwrapped
+    env.reset(seed=2, options={"spot_damage": 0, "light_dim_off_duration": 0})
+    for step in range(60):
+        observation, _, _, _, info = env.step([0, 0])
+        frame = env.render()
+        assert frame.shape == (336, 336, 3)
+        assert frame.dtype == np.uint8
+        view = observation.repeat(4, 0).repeat(4, 1)
+        assert np.array_equal(frame[:16], view[:16])  # the bar
+        circle = (frame == (0, 255, 0)).all(axis=-1)
+        circle[:16] = False
+        seen = (view[16:] > 0).any(axis=-1) & ~circle[16:]
+        assert np.array_equal(frame[16:][seen], view[16:][seen])
+        spot = env.batch.state.spot[:, 0]
+        on_screen = ((spot > 0) & (spot < 84)).all(axis=0).any()
+        assert not on_screen or circle.any()
+        for x, y in (info["ground_truth"] * 336).reshape(-1, 2):
+            thing = frame[round(y) - 4 : round(y) + 4, round(x) - 4 : round(x) + 4].reshape(-1, 3)
+            floor = {(255, 255, 255), (0, 0, 255), (255, 0, 0), (0, 255, 0)}
+            assert {tuple(pixel) for pixel in thing.tolist()} - floor, step
+
+
+def test_spotlights_show_what_they_light():
+    """With a black floor, only the agent, the coin, the exit and the white rims of spotlights can be seen."""
+    env = gym.make("SearingSpotlights-v0").unwrapped
+    options = {"black_background": True, "spot_damage": 0, "initial_spawns": 12, "light_dim_off_duration": 0}
+    env.reset(seed=3, options=options)
+    colors = set()
+    for _ in range(120):
+        observation, *_ = env.step([0, 0])
+        colors |= {tuple(pixel) for pixel in observation[4:].reshape(-1, 3).tolist()}
+    rim, body, hand, coin, door = (255, 255, 255), (250, 204, 153), (50, 50, 50), (255, 165, 0), (55, 55, 55)
+    assert colors <= {(0, 0, 0), rim, body, hand, coin, door}
+    assert colors >= {(0, 0, 0), rim, body}
+
+
+def test_nothing_painted_black_or_white_stays():
+    """In the original, black_background and hide_chessboard last for as long as the environment."""
+    env, fresh = gym.make("SearingSpotlights-v0"), gym.make("SearingSpotlights-v0")
+    for option in ("black_background", "hide_chessboard"):
+        first, _ = env.reset(seed=1, options={option: True})
+        assert not (first[4:] == (0, 0, 255)).all(axis=-1).any()
+        assert np.array_equal(env.reset(seed=2)[0], fresh.reset(seed=2)[0])
+
+
+@SPOTLIGHTS
+def test_visible_in_the_dark(env_id):
+    """What the options make visible is drawn over the darkness, every step."""
+    names = ["agent_visible", "coins_visible"] + ["exit_visible"] * ("Endless" not in env_id)
+    env = gym.make(env_id).unwrapped
+    env.reset(seed=4, options={**dict.fromkeys(names, True), "initial_spawns": 0})
+    for _ in range(30):
+        observation, _, over, _, _ = env.step([0, 0])
+        colors = {tuple(pixel) for pixel in observation[4:].reshape(-1, 3).tolist()}
+    assert not over
+    assert colors >= {(0, 0, 0), (250, 204, 153), (255, 165, 0)}
+    assert ((55, 55, 55) in colors) == ("exit_visible" in names)
+
+
 def test_needs_neither_pygame_nor_torch():
     """The package imports NumPy and Gymnasium only."""
     code = "import sys, memory_gym_envs; print([m for m in ('pygame', 'torch', 'memory_gym') if m in sys.modules])"
@@ -566,5 +669,7 @@ def test_ids():
         "MortarMayhemB-v0",
         "MortarMayhemB-Grid-v0",
         "Endless-MortarMayhem-v0",
+        "SearingSpotlights-v0",
+        "Endless-SearingSpotlights-v0",
     }
     assert all(env_id in gym.registry for env_id in memory_gym_envs.IDS)

@@ -3,9 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from players import player
+from players import FAMILY, choices, player
 
 import memory_gym_envs
+from memory_gym_envs import MortarMayhem, SearingSpotlights
 
 LANES = 5
 OPTIONS = {
@@ -14,6 +15,12 @@ OPTIONS = {
     "MortarMayhemB-v0": {"agent_scale": 0.4, "agent_speed": 4.5},
     "MortarMayhemB-Grid-v0": {"arena_size": 3, "explosion_duration": [1, 2]},
     "Endless-MortarMayhem-v0": {"max_steps": 120, "explosion_delay": [12, 18], "agent_speed": 3.7},
+    "SearingSpotlights-v0": {"num_coins": [0, 2, 4], "coin_scale": 0.6, "initial_spawns": 10, "black_background": True},
+    "Endless-SearingSpotlights-v0": {"steps_per_coin": 40, "light_threshold": 150, "agent_visible": True},
+}
+CHANGED = {
+    MortarMayhem: {"explosion_delay": [9], "agent_scale": 0.5},
+    SearingSpotlights: {"spot_min_radius": 2.0, "spot_max_radius": 30, "initial_spawns": 9, "agent_scale": 0.5},
 }
 
 
@@ -31,7 +38,7 @@ def mixed_actions(envs, rng) -> np.ndarray:
     """Players that stumble, the later lanes ever more often, so that episodes of all lengths occur."""
     actions = player(envs)
     stumble = rng.random(envs.num_envs) < np.linspace(0.1, 1.0, envs.num_envs)
-    random = rng.integers(0, 4 if envs.variant.grid else 3, actions.shape)
+    random = rng.integers(0, choices(envs), actions.shape)
     return np.where(stumble if actions.ndim == 1 else stumble[:, None], random, actions)
 
 
@@ -79,12 +86,13 @@ def test_reset_mask_resets_only_its_lanes(env_id):
         before, *_ = envs.step(actions)
         twin.step(actions)
     mask = np.array([False, True, False, True])
-    options = {"reset_mask": mask, "explosion_delay": [9], "agent_scale": 0.5}
+    changed = CHANGED[FAMILY[env_id]]
+    options = {"reset_mask": mask, **changed}
     after, infos = envs.reset(seed=[None, 7, None, 8], options=options)
-    assert list(options) == ["reset_mask", "explosion_delay", "agent_scale"]  # the caller's dictionary is untouched
+    assert list(options) == ["reset_mask", *changed]  # the caller's dictionary is untouched
     single = gym.make(env_id)
     for lane, level in ((1, 7), (3, 8)):
-        fresh, _ = single.reset(seed=level, options={"explosion_delay": [9], "agent_scale": 0.5})
+        fresh, _ = single.reset(seed=level, options=changed)
         assert same(lane_of(after, lane), fresh)
     for lane in (0, 2):
         assert same(lane_of(after, lane), lane_of(before, lane))
@@ -97,7 +105,7 @@ def test_reset_mask_resets_only_its_lanes(env_id):
         for lane in (0, 2):
             assert same(lane_of(ours[0], lane), lane_of(theirs[0], lane))
             assert [part[lane] for part in ours[1:4]] == [part[lane] for part in theirs[1:4]]
-    assert envs.state.fuse[[1, 3]].tolist() == [9, 9]
+    assert [each == envs.defaults for each in envs.settings] == [True, False, True, False]
 
 
 def test_lanes_with_different_options_differ():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from players import player
 
-import memory_gym_envs
+from memory_gym_envs import MortarMayhem
 
 # Table 4.4, but for the act tasks: the thesis' formula says 18 to 234 and 6 to 78 there. The original itself, whose
 # first command has one step more than the others, needs one step more; behind a clue the reset makes up for it.
@@ -144,7 +144,7 @@ def test_endless_player_never_fails(limit):
     assert info["max_command_sequence"] == completed
 
 
-@pytest.mark.parametrize("env_id", memory_gym_envs.IDS)
+@pytest.mark.parametrize("env_id", MortarMayhem.variants)
 def test_players_in_lanes(env_id):
     """The same returns with automatic resets, several episodes a lane."""
     envs = gym.make_vec(env_id, num_envs=LANES)

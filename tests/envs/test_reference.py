@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import memory_gym_envs
+from memory_gym_envs import MortarMayhem
 
 FOLDER = Path(os.environ.get("REFERENCE_TRACES") or Path(__file__).resolve().parents[1] / "data")
 FILES = sorted(path for path in FOLDER.glob("*.npz") if path.name.split(".")[0] in memory_gym_envs.IDS)
@@ -62,7 +63,7 @@ def test_alone(path):
         assert reward == recording.rewards[step]
         assert (terminated or truncated) == recording.dones[step]
         if truncated:
-            assert step + 1 == recording.options["max_steps"]
+            assert step + 1 == env.unwrapped.batch.settings[0]["max_steps"]
         recording.check(step + 1, observation, info["ground_truth"])
     recording.check_end(info)
 
@@ -72,7 +73,8 @@ def test_as_a_lane(path):
     """The other lanes play other levels, with other options and random actions."""
     recording = Recording(path)
     envs = gym.make_vec(recording.env_id, num_envs=LANES)
-    envs.reset(seed=5, options={"agent_scale": 0.5, "explosion_delay": [5]})
+    own = {"explosion_delay": [5]} if isinstance(envs, MortarMayhem) else {"initial_spawns": 9}
+    envs.reset(seed=5, options={"agent_scale": 0.5, **own})
     mask = np.arange(LANES) == LANE
     seeds = [None, recording.seed, None]
     observations, infos = envs.reset(seed=seeds, options={"reset_mask": mask, **recording.options})
