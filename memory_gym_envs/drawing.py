@@ -10,6 +10,7 @@ import numpy as np
 SCREEN = 84  # width and height of an observation in pixels
 ROW = 3 * SCREEN  # bytes in a row of a frame
 FRAME = SCREEN * ROW  # bytes in a frame
+FEW = 4  # sprites that are pasted faster one by one
 
 
 def disk(size: int, x: float, y: float, radius: int) -> np.ndarray:
@@ -61,6 +62,7 @@ class Sheet(NamedTuple):
     canvas: int  # width and height of a sprite's canvas
     keep: np.ndarray  # (starts, W) rows: the windows at every start; 255 where a sprite is transparent
     ink: np.ndarray  # (starts, W) likewise: colours, 0 where a sprite is transparent
+    canvases: tuple[np.ndarray, np.ndarray]  # what those are windows of
     frame_start: np.ndarray  # (P * P,) first pixel of the frame's window, for every y and x
     canvas_start: np.ndarray  # (P * P,) first pixel of the canvas' window, for every y and x
     positions: int  # P
@@ -89,6 +91,7 @@ def make_sheet(sprites: np.ndarray, solid: np.ndarray, positions: np.ndarray) ->
         canvas,
         windows(keep, canvas, row),
         windows(ink, canvas, row),
+        (keep, ink),
         (frame_start[:, None] * SCREEN + frame_start).reshape(-1),
         (source[:, None] * canvas + source).reshape(-1),
         len(positions),
@@ -101,6 +104,10 @@ def paste(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, a
     frames: (n, FRAME) uint8, contiguous, changed in place. rows: (n,). pos: (n, 2), x and y, indices of positions.
     at: different frames; None: all of them.
     """
+    if len(rows) <= FEW:
+        for i in range(len(rows)):
+            _paste_one(frames, sheet, rows[i], pos[i], i if at is None else at[i])
+        return
     place = pos[:, 1] * sheet.positions + pos[:, 0]  # (n,)
     first = np.arange(0, len(frames) * SCREEN * SCREEN, SCREEN * SCREEN) if at is None else at * (SCREEN * SCREEN)
     start = sheet.frame_start.take(place) + first
@@ -111,6 +118,18 @@ def paste(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, a
     pixels &= sheet.keep[source].view(np.uint8)
     pixels |= sheet.ink[source].view(np.uint8)
     squares[start] = patch
+
+
+def _paste_one(frames: np.ndarray, sheet: Sheet, row: int, pos: np.ndarray, at: int) -> None:
+    """Pastes one sprite: the same as `paste`, in fewer calls."""
+    place = pos[1] * sheet.positions + pos[0]
+    start = 3 * (sheet.frame_start[place] + at * (SCREEN * SCREEN))
+    source = 3 * (sheet.canvas_start[place] + row * (sheet.canvas * sheet.canvas))
+    square, pitch = (sheet.row.itemsize // 3, sheet.row.itemsize), (3 * sheet.canvas, 1)
+    patch = np.ndarray(square, np.uint8, frames, start, (ROW, 1))
+    keep, ink = (np.ndarray(square, np.uint8, canvas, source, pitch) for canvas in sheet.canvases)
+    patch &= keep
+    patch |= ink
 
 
 def windows(images: np.ndarray, across: int, row: np.dtype) -> np.ndarray:

@@ -19,7 +19,6 @@ from memory_gym_envs.character import (
     STRIDES,
     Figure,
     free_controls,
-    hand_places,
     radius_of,
     walk,
     wardrobe,
@@ -127,11 +126,12 @@ class State:
 
     pos: np.ndarray  # (N, 2) the agent's centre, x and y
     facing: np.ndarray  # (N,)
+    look: np.ndarray  # (N,) the facing that is drawn
     figure: np.ndarray  # (N,) which of the batch's figures the agent is
     bodies: np.ndarray  # (2, N, B) x and y of the agent, the exit and the coins; GONE where there is none
     touch: np.ndarray  # (N, B) float64: square of the distance at which the agent touches them
-    extent: np.ndarray  # (N, B) float64: how far from its centre a body may be seen
     props: np.ndarray  # (N,) the row of the props' sheet with the lane's coin; its closed and its open exit follow
+    is_open: np.ndarray  # (N,) 1 if the exit is open
     goal: np.ndarray  # (N, 4) float64: x and y of the first coin left and of the exit; 0 where there is none
     coins: np.ndarray  # (N,) in this episode
     left: np.ndarray  # (N,) of them
@@ -146,7 +146,8 @@ class State:
     wait: np.ndarray  # (N,) steps until the next one
     spawns: np.ndarray  # (N,) spotlights to follow
     health: np.ndarray  # (N,) float64
-    floor: np.ndarray  # (N,) picture of the floor, a row of floors()
+    scenery: np.ndarray  # (2 * N, FRAME) uint8: each lane's floor, coins and exit in full light: calm, then alarmed
+    floor: np.ndarray  # (N,) which row of the scenery shows
     red: np.ndarray  # (N,) pixels of the top bar that show lost health
     last_action: np.ndarray  # (N,) 3 * horizontal + vertical
     shown_action: np.ndarray  # (N,) that of the step before
@@ -161,14 +162,14 @@ class State:
     interval: np.ndarray  # (N,) steps between spotlights
     full: np.ndarray  # (N,) float64: health at the start
     damage: np.ndarray  # (N,) float64
-    calm: np.ndarray  # (N,) the floor in the dark
-    alarm: np.ndarray  # (N,) the floor while the agent is in the light
+    floors: np.ndarray  # (N, 2) rows of floors(): while the agent is in the dark, and in the light
     rim: np.ndarray  # (N,) bool: spotlights have a white rim
     darkness: np.ndarray  # (N, FADE) uint8: opacity of the dark after so many steps
     dark_at: np.ndarray  # (N,) steps until it is opaque and nothing else
     senses: np.ndarray  # (N,) the first row of bars() that shows what the lane may see
     exit_layer: np.ndarray  # (N,) UNDER the dark, or above it and BELOW_BAR or ABOVE_BAR
     agent_layer: np.ndarray  # (N,) likewise
+    layered: np.ndarray  # (N,) bool: either is above the dark
     reward_inside: np.ndarray  # (N,) float64
     reward_outside: np.ndarray  # (N,) float64
     reward_death: np.ndarray  # (N,) float64
@@ -182,12 +183,16 @@ FADE = 257  # steps after which the darkness no longer changes
 
 def empty_state(lanes: int) -> State:
     """The state of N lanes before their first reset, with room for no coin and one spotlight."""
-    shapes = {"pos": (lanes, 2), "bodies": (2, lanes, COIN), "touch": (lanes, COIN), "extent": (lanes, COIN)}
+    shapes = {"pos": (lanes, 2), "bodies": (2, lanes, COIN), "touch": (lanes, COIN)}
     shapes |= {"goal": (lanes, 4), "spots": (len(NO_SPOT), lanes, 1), "spot_key": (lanes, 1), "darkness": (lanes, FADE)}
-    shapes |= dict.fromkeys(("spot", "place"), (2, lanes, 1))
-    floats = ("touch", "extent", "goal", "spots", "spot", "health", "returned", "full", "damage")
+    shapes |= dict.fromkeys(("spot", "place"), (2, lanes, 1)) | {"scenery": (2 * lanes, FRAME), "floors": (lanes, 2)}
+    floats = ("touch", "goal", "spots", "spot", "health", "returned", "full", "damage")
     rewards = ("reward_inside", "reward_outside", "reward_death", "reward_coin", "reward_exit")
-    kinds = dict.fromkeys((*floats, *rewards), np.float64) | {"rim": bool, "darkness": np.uint8}
+    kinds = (
+        dict.fromkeys((*floats, *rewards), np.float64)
+        | {"rim": bool, "layered": bool}
+        | dict.fromkeys(("darkness", "scenery"), np.uint8)
+    )
     names = State.__dataclass_fields__
     return State(**{name: np.zeros(shapes.get(name, (lanes,)), kinds.get(name, np.int64)) for name in names})
 
@@ -202,8 +207,7 @@ def widened(array: np.ndarray, width: int, filler: float = 0) -> np.ndarray:
 
 def make_room(s: State, coins: int = 0, spots: int = 0) -> None:
     """Widens the state's arrays, where they are too narrow, for so many coins and spotlights in a lane."""
-    s.bodies = widened(s.bodies, COIN + coins, GONE)
-    s.touch, s.extent = widened(s.touch, COIN + coins), widened(s.extent, COIN + coins)
+    s.bodies, s.touch = widened(s.bodies, COIN + coins, GONE), widened(s.touch, COIN + coins)
     old = s.spot_key.shape[1]
     if spots > old:
         s.spots, s.spot_key = widened(s.spots, spots), widened(s.spot_key, spots, NO_KEY)
@@ -226,39 +230,47 @@ class Level(NamedTuple):
 
 def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
     """Draws a level in the original's order, so that its seeds mean the same here."""
-    free = np.ones((SCREEN, SCREEN), bool)
     facing = int(rng.integers(ZERO, EIGHT))
     if values["sample_agent_position"]:
-        pos = draw_place(rng, free, AGENT_SPACE)
+        pos, free = draw_place(rng, None, AGENT_SPACE)
     else:
         pos = (MIDDLE, MIDDLE)
-        occupy(free, pos, COIN_SPACE)
+        free = occupied(None, pos, COIN_SPACE)
     spots = [draw_spot(rng, values) for _ in range(values["initial_spawns"])]
     if variant.endless:
         return Level(facing, pos, spots, [draw_coin(rng, None)] if values["coin_enabled"] else [], None)
-    coins = [inside(draw_place(rng, free, COIN_SPACE)) for _ in range(_pick(rng, values["num_coins"]))]
-    return Level(facing, pos, spots, coins, inside(draw_place(rng, free, COIN_SPACE)) if values["use_exit"] else None)
+    things = []
+    for _ in range(_pick(rng, values["num_coins"]) + values["use_exit"]):
+        place, free = draw_place(rng, free, COIN_SPACE)
+        things.append(inside(place))
+    return Level(facing, pos, spots, things, things.pop() if values["use_exit"] else None)
 
 
 # Arrays without dimensions: the generator takes them faster than numbers, and draws the same.
-ZERO, TWO, FOUR, EIGHT, TURN = (np.array(number) for number in (0, 2, 4, 8, 360))
+ZERO, TWO, FOUR, EIGHT, TURN, EVERYWHERE = (np.array(number) for number in (0, 2, 4, 8, 360, SCREEN * SCREEN))
+RADII = [np.array(radius) for radius in range(SPOT_RADII[1] + 2)]
 ASIDE, ASKEW = (np.array(-45), np.array(45)), (np.array(-135), np.array(135))
 
 
-def draw_place(rng: np.random.Generator, free: np.ndarray, space: int) -> tuple[int, int]:
-    """A place near a free pixel; the pixels around that one are occupied then. free: (84, 84) bool, updated."""
-    cells = np.flatnonzero(free)
-    if not cells.size:  # the original fails here
-        cells = np.arange(free.size)
-    y, x = divmod(int(cells[rng.integers(0, cells.size)]), SCREEN)
-    occupy(free, (x, y), space)
-    return x + int(rng.integers(TWO, FOUR)), y + int(rng.integers(TWO, FOUR))
+def draw_place(rng: np.random.Generator, free: np.ndarray | None, space: int) -> tuple[tuple[int, int], np.ndarray]:
+    """A place near a free pixel, and what is free when the pixels around that one are occupied.
+
+    free: (84, 84) bool, or None: every pixel is.
+    """
+    cells = None if free is None else np.flatnonzero(free)
+    if cells is None or not cells.size:  # where nothing is free, the original fails
+        cell = int(rng.integers(ZERO, EVERYWHERE))
+    else:
+        cell = int(cells[rng.integers(0, cells.size)])
+    y, x = divmod(cell, SCREEN)
+    return (x + int(rng.integers(TWO, FOUR)), y + int(rng.integers(TWO, FOUR))), occupied(free, (x, y), space)
 
 
-def occupy(free: np.ndarray, pos: tuple[int, int], space: int) -> None:
-    """Marks the pixels that are less than `space` away as not free."""
+def occupied(free: np.ndarray | None, pos: tuple[int, int], space: int) -> np.ndarray:
+    """What is free when the pixels less than `space` away are not. free: (84, 84) bool, or None: every pixel is."""
     left, top = SCREEN - 1 - pos[0], SCREEN - 1 - pos[1]
-    free &= _distant(space)[top : top + SCREEN, left : left + SCREEN]
+    rest = _distant(space)[top : top + SCREEN, left : left + SCREEN]
+    return rest if free is None else free & rest
 
 
 @cache
@@ -276,24 +288,22 @@ def inside(pos: tuple[int, int]) -> tuple[int, int]:
 
 def draw_coin(rng: np.random.Generator, last: tuple[int, int] | None) -> tuple[int, int]:
     """The endless task's next coin, away from the last one. It may lie under the agent, as in the original."""
-    free = np.ones((SCREEN, SCREEN), bool)
-    if last is not None:
-        occupy(free, last, AGENT_SPACE)
-    return inside(draw_place(rng, free, AGENT_SPACE))
+    free = None if last is None else occupied(None, last, AGENT_SPACE)
+    return inside(draw_place(rng, free, AGENT_SPACE)[0])
 
 
 def draw_spot(rng: np.random.Generator, values: dict[str, Any]) -> list[float]:
     """A new spotlight, a column of State.spots: on a bent path from one side of the screen to roughly the other."""
     least, slowest = values["spot_min_radius"], values["spot_min_speed"]
-    radius = int(rng.integers(int(least), int(max(least, values["spot_max_radius"]) + 1)))
+    radius = int(rng.integers(RADII[int(least)], RADII[int(max(least, values["spot_max_radius"])) + 1]))
     speed = rng.uniform(slowest, max(slowest, values["spot_max_speed"]))
     start = int(rng.integers(ZERO, TURN))
-    target = start + 180 + int(rng.integers(*ASIDE))
-    offset = target + int(rng.integers(*ASKEW))
+    target = start + 180 + int(rng.integers(ASIDE[0], ASIDE[1]))
+    offset = target + int(rng.integers(ASKEW[0], ASKEW[1]))
     far = OUTSIDE + radius
-    (x, y), (to_x, to_y), (off_x, off_y) = (
-        (MIDDLE + far * across, MIDDLE + far * down) for across, down in (UNITS[start], UNITS[target], UNITS[offset])
-    )
+    x, y = (MIDDLE + far * part for part in UNITS[start])
+    to_x, to_y = (MIDDLE + far * part for part in UNITS[target])
+    off_x, off_y = (MIDDLE + far * part for part in UNITS[offset])
     reach = (radius + radius_of(values["agent_scale"])) ** 2
     return [0.0, speed, radius, reach, x, y, to_x - x, to_y - y, off_x - to_x, off_y - to_y]
 
@@ -320,7 +330,8 @@ def write_level(s: State, lane: int, level: Level, spawns: int) -> None:
     """Starts the lane's episode at this level, with so many spotlights to follow."""
     coins = len(level.coins)
     make_room(s, spots=len(level.spots))
-    s.facing[lane] = level.facing
+    # Before the first step the agent is drawn facing up wherever it faces, as in the original.
+    s.facing[lane], s.look[lane] = level.facing, 0
     s.bodies[:, lane] = GONE
     s.bodies[:, lane, AGENT] = level.pos
     for axis in range(2):
@@ -332,17 +343,17 @@ def write_level(s: State, lane: int, level: Level, spawns: int) -> None:
         s.bodies[:, lane, EXIT] = s.goal[lane, 2:] = level.exit
     s.coins[lane] = s.left[lane] = coins
     aim(s, lane)
-    s.spots[:, lane] = NO_SPOT[:, None]
-    s.spot_key[lane] = NO_KEY
-    s.count[lane] = 0
-    for spot in level.spots:
-        add_spot(s, lane, spot)
+    s.spots[:, lane], s.spot_key[lane], s.count[lane] = NO_SPOT[:, None], NO_KEY, len(level.spots)
+    if level.spots:
+        s.spots[:, lane, : len(level.spots)] = np.array(level.spots).T
+        s.spot_key[lane, : len(level.spots)] = [spot[RADIUS] * PLACES + PLACE_0 for spot in level.spots]
     s.spot[:, lane], s.place[:, lane] = AWAY, 0  # they shine from the first step on
     s.spawns[lane], s.wait[lane] = spawns, s.interval[lane] if spawns else NO_LIMIT
     s.health[lane] = s.full[lane]
-    s.floor[lane] = s.calm[lane]
-    for field in (s.collected, s.coin_age, s.success, s.red, s.last_action, s.shown_action, s.shown_gain, s.length):
+    s.floor[lane] = 2 * lane
+    for field in (s.collected, s.coin_age, s.success, s.is_open, s.red, s.length):
         field[lane] = 0
+    s.last_action[lane] = s.shown_action[lane] = s.shown_gain[lane] = 0
     s.last_gain[lane], s.returned[lane] = 1, 0.0
 
 
@@ -530,129 +541,111 @@ class Art(NamedTuple):
 
 def draw(s: State, art: Art, lanes: np.ndarray | slice) -> np.ndarray:
     """Fresh frames of the lanes, (n, 84, 84, 3) uint8, from the state alone."""
+    frames = scene(s, art, lanes)
     lit, rim = shine(s, art.lamps, lanes)
-    shown = near_light(s, lanes)
-    dim = np.flatnonzero(s.length[lanes] < s.dark_at[lanes])
-    if dim.size:
-        shown[dim] = (s.bodies[0] != GONE)[lanes][dim]
-    frames = scene(s, art, lanes, shown)
-    darken(frames, pixels(lit), s, lanes, dim, rim)
-    raised = np.count_nonzero(s.exit_layer[lanes]) or np.count_nonzero(s.agent_layer[lanes])
+    darken(s, lanes, frames, pixels(lit), rim)
     coins = s.coin_age[lanes] < s.coin_show[lanes]
     if np.count_nonzero(coins):
-        put_coins(s, art, frames, lanes, (s.bodies[0, :, COIN:] != GONE)[lanes] & coins[:, None])
-    if raised:
-        put_layer(s, art, frames, lanes, BELOW_BAR)
+        put_coins(s, art, lanes, frames, coins)
+    layered = np.count_nonzero(s.layered[lanes])
+    if layered:
+        put_layer(s, art, lanes, frames, BELOW_BAR)
     senses = s.senses[lanes] + (3 * s.shown_action[lanes] + s.shown_gain[lanes]) * WIDTHS + s.red[lanes]
     frames.reshape(-1, SCREEN, ROW)[:, :BAR] = art.bars.take(senses, axis=0)[:, None]
-    if raised:
-        put_layer(s, art, frames, lanes, ABOVE_BAR)
+    if layered:
+        put_layer(s, art, lanes, frames, ABOVE_BAR)
     return frames.reshape(-1, SCREEN, SCREEN, 3)
+
+
+def scene(s: State, art: Art, lanes: np.ndarray | slice) -> np.ndarray:
+    """The lanes in full light: (n, FRAME) uint8."""
+    frames = s.scenery.take(s.floor[lanes], axis=0)
+    put_agent(s, art, lanes, frames, True)
+    return frames
+
+
+def furnish(s: State, art: Art, lane: int) -> None:
+    """Draws the lane's scenery, whenever a coin or the exit has changed."""
+    frames, twice = floors().take(s.floors[lane], axis=0), np.array([lane, lane])
+    put_coins(s, art, twice, frames, True)
+    put_exit(s, art, twice, frames, True)
+    s.scenery[2 * lane : 2 * lane + 2] = frames
+
+
+def put_coins(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool) -> None:
+    """Draws the coins of the lanes that are shown, (n,) bool, into the frames, in place."""
+    looks = s.props[lanes]
+    for coin in range(COIN, s.bodies.shape[2]):
+        pos = s.bodies[:, lanes, coin].T  # (n, 2)
+        put(frames, art.props, looks, pos, shown & (pos[:, 0] != GONE))
+
+
+def put_exit(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool) -> None:
+    """Draws the exits of the lanes that are shown, (n,) bool, into the frames, in place."""
+    pos = s.bodies[:, lanes, EXIT].T  # (n, 2)
+    put(frames, art.props, (s.props + s.is_open)[lanes] + 1, pos, shown & (pos[:, 0] != GONE))
+
+
+def put_agent(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool) -> None:
+    """Draws the agents of the lanes that are shown, (n,) bool, into the frames, in place."""
+    put(frames, art.figures, (s.figure * FACINGS + s.look)[lanes], s.pos[lanes], shown)
+
+
+def put(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, shown: np.ndarray | bool) -> None:
+    """Pastes sprite rows[i] of the sheet at pos[i] into those of the frames that are shown, (n,) bool or just True."""
+    if shown is True or np.count_nonzero(shown) == len(rows):
+        paste(frames, sheet, rows, pos)
+    else:
+        at = np.flatnonzero(shown)
+        if at.size:
+            paste(frames, sheet, rows[at], pos[at], at)
+
+
+def put_layer(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, layer: int) -> None:
+    """Draws the exits and agents that belong to this layer, which the darkness does not cover."""
+    put_exit(s, art, lanes, frames, s.exit_layer[lanes] == layer)
+    put_agent(s, art, lanes, frames, s.agent_layer[lanes] == layer)
 
 
 def shine(s: State, tables: Lamps, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
     """What the spotlights light and, if any has a rim, which pixels those are: bits, (n, 504) uint16."""
     across, down = s.place[:, lanes]
-    start = tables.column.take(across) + tables.row.take(down)  # (n, S)
-    lit = _overlaid(tables.disks[start])
-    rimmed = np.flatnonzero(s.rim[lanes])
-    if not rimmed.size:
+    start = (tables.column.take(across) + tables.row.take(down)).T.copy()  # (S, n)
+    lit = np.bitwise_or.reduce(_words(tables.disks[start]), axis=0).view(np.uint16)
+    if not np.count_nonzero(s.rim[lanes]):
         return lit, None
     # A later spotlight covers the rims of the earlier ones, and its own rim covers their light.
-    inner, rim = (np.zeros((rimmed.size, ITEMS * SCREEN), np.uint16) for _ in range(2))
-    for spot in start[rimmed].T:  # (n,)
-        own, disk_ = _overlaid(tables.rims[spot[:, None]]), _overlaid(tables.disks[spot[:, None]])
+    inner, rim = np.zeros((2, start.shape[1], ITEMS * SCREEN), np.uint16)
+    for spot in start:  # (n,)
+        disk_, own = (_words(table[spot]).view(np.uint16) for table in (tables.disks, tables.rims))
         inner, rim = (inner | disk_) & ~own, (rim & ~disk_) | own
-    rims = np.zeros_like(lit)
-    lit[rimmed], rims[rimmed] = inner, rim
-    return lit, rims
+    rimmed = s.rim[lanes][:, None]
+    return np.where(rimmed, inner, lit), rim * rimmed
 
 
-def _overlaid(windows: np.ndarray) -> np.ndarray:
-    """The union of pictures, (n, S) windows of a tape, as (n, 504) uint16."""
-    words = windows.view(np.uint64).reshape(*windows.shape, -1)  # (n, S, 126)
-    return np.bitwise_or.reduce(words, axis=1).view(np.uint16)
+def _words(windows: np.ndarray) -> np.ndarray:
+    """Windows of a tape as (..., 126) uint64."""
+    return windows.view(np.uint64).reshape(*windows.shape, -1)
 
 
-def near_light(s: State, lanes: np.ndarray | slice) -> np.ndarray:
-    """(n, B) bool: which bodies may be in the light. Not exact, but no body that is in the light is missing."""
-    gap = s.spot[:, lanes, None] - s.bodies[:, lanes, :, None]  # (2, n, B, S)
-    gap *= gap
-    reach = s.spots[RADIUS][lanes][:, None] + s.extent[lanes][:, :, None]  # (n, B, S)
-    reach *= reach
-    return (gap[0] + gap[1] < reach).any(axis=2)
+def darken(s: State, lanes: np.ndarray | slice, frames: np.ndarray, lit: np.ndarray, rim: np.ndarray | None) -> None:
+    """Lays the darkness over the lanes' frames, (n, FRAME), in place.
 
-
-def scene(s: State, art: Art, lanes: np.ndarray | slice, shown: np.ndarray) -> np.ndarray:
-    """The lanes in full light: (n, FRAME) uint8. shown: (n, B) bool, the bodies to draw."""
-    frames = floors().take(s.floor[lanes], axis=0)
-    if np.count_nonzero(shown):
-        put_coins(s, art, frames, lanes, shown[:, COIN:])
-        put_exit(s, art, frames, lanes, shown[:, EXIT])
-        put_agent(s, art, frames, lanes, shown[:, AGENT])
-    return frames
-
-
-def darken(
-    frames: np.ndarray,
-    lit: np.ndarray,
-    s: State,
-    lanes: np.ndarray | slice,
-    dim: np.ndarray,
-    rim: np.ndarray | None,
-) -> None:
-    """Lays the darkness over the frames, (n, FRAME), in place.
-
-    lit: (n, FRAME) mask of what it leaves out. dim: those of the n lanes in which it is not just black.
-    rim: (n, 504) bits of it that are white instead, or None.
+    lit: (n, FRAME) mask of what it leaves out. rim: (n, 504) bits of it that are white, or None.
     """
+    dim = np.flatnonzero(s.length[lanes] < s.dark_at[lanes])  # where it is not just black
     if dim.size:
         who = dim if isinstance(lanes, slice) else lanes[dim]
         opacity = s.darkness[who, np.minimum(s.length[who], FADE - 1)].astype(np.uint16)[:, None]
-        bright = frames[dim].astype(np.uint16)
-        veiled = bright - bright * opacity // 255
+        bright = frames[dim]
+        veiled = bright - (bright * opacity // 255).astype(np.uint8)
         if rim is not None:
             white = pixels(rim[dim]) > 0
-            veiled[white] = (bright + (255 - bright) * opacity // 255)[white]
-        veiled = veiled.astype(np.uint8) & ~lit[dim]
+            veiled[white] = (bright + ((255 - bright) * opacity // 255).astype(np.uint8))[white]
+        veiled &= ~lit[dim]
     frames &= lit
     if dim.size:
         frames[dim] |= veiled
-
-
-def put_coins(s: State, art: Art, frames: np.ndarray, lanes: np.ndarray | slice, shown: np.ndarray) -> None:
-    """Draws the coins, shown (n, coins) bool, into the lanes' frames, in place."""
-    for coin in range(shown.shape[1]):
-        at = np.flatnonzero(shown[:, coin])
-        if at.size:
-            who = at if isinstance(lanes, slice) else lanes[at]
-            paste(frames, art.props, s.props[who], s.bodies[:, who, COIN + coin].T, at)
-
-
-def put_exit(s: State, art: Art, frames: np.ndarray, lanes: np.ndarray | slice, shown: np.ndarray) -> None:
-    """Draws the exit, shown (n,) bool, into the lanes' frames, in place."""
-    at = np.flatnonzero(shown)
-    if at.size:
-        who = at if isinstance(lanes, slice) else lanes[at]
-        # It opens in the step that takes the last coin, so not before the first step even without any.
-        is_open = (s.left[who] == 0) & (s.length[who] > 0)
-        paste(frames, art.props, s.props[who] + 1 + is_open, s.bodies[:, who, EXIT].T, at)
-
-
-def put_agent(s: State, art: Art, frames: np.ndarray, lanes: np.ndarray | slice, shown: np.ndarray) -> None:
-    """Draws the agent, shown (n,) bool, into the lanes' frames, in place."""
-    at = np.flatnonzero(shown)
-    if at.size:
-        who = at if isinstance(lanes, slice) else lanes[at]
-        # Before the first step it is drawn facing up wherever it faces, as in the original.
-        facing = s.facing[who] * (s.length[who] > 0)
-        paste(frames, art.figures, s.figure[who] * FACINGS + facing, s.pos[who], at)
-
-
-def put_layer(s: State, art: Art, frames: np.ndarray, lanes: np.ndarray | slice, layer: int) -> None:
-    """Draws the exits and agents that belong to this layer, which the darkness does not cover."""
-    put_exit(s, art, frames, lanes, (s.exit_layer[lanes] == layer) & (s.bodies[0, :, EXIT] != GONE)[lanes])
-    put_agent(s, art, frames, lanes, s.agent_layer[lanes] == layer)
 
 
 # ---- rules ----
@@ -685,7 +678,7 @@ def retire(s: State) -> tuple[np.ndarray, np.ndarray]:
 def burn(s: State, lanes: np.ndarray) -> np.ndarray:
     """Damages the agents of these lanes; (n,) bool whose health is gone."""
     s.health[lanes] -= s.damage[lanes]
-    s.floor[lanes] = s.alarm[lanes]
+    s.floor[lanes] += 1
     lost = 1 - s.health[lanes] / s.full[lanes]
     s.red[lanes] = np.minimum(SCREEN // 2 * lost, SCREEN)  # cut off to whole pixels
     return s.health[lanes] <= 0
@@ -701,6 +694,7 @@ def take_coins(s: State, lane: int, touched: np.ndarray) -> int:
             s.bodies[:, lane, coin] = GONE
             taken, skip = taken + 1, True
     s.left[lane] -= taken
+    s.is_open[lane] = s.left[lane] == 0
     s.collected[lane] += taken
     aim(s, lane)
     return taken
@@ -760,6 +754,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         self.state = empty_state(self.num_envs)
         self._settle()
         self._through = False  # whether any spotlight has to be removed
+        self._unlocked: list[int] = []  # lanes without coins, whose exits open in the first step
         self._place_tables()
 
     def configure(self, lanes: np.ndarray) -> None:
@@ -777,9 +772,6 @@ class SearingSpotlights(MemoryGymVectorEnv):
         coin, exit_ = int(10 * values["coin_scale"]), 10 * values.get("exit_scale", 0.0)
         s.touch[lanes, COIN:], s.touch[lanes, EXIT] = (coin + radius) ** 2, (exit_ + radius) ** 2
         s.touch[lanes, AGENT] = -1.0
-        # A spotlight is drawn at whole pixels, so up to 1.5 away from where it is; the exit has corners.
-        s.extent[lanes, COIN:], s.extent[lanes, EXIT] = coin + 3, 1.5 * exit_ + 3
-        s.extent[lanes, AGENT] = _extent(values["agent_scale"]) + 3
         self._configure_pictures(lanes, values)
         self._settle()
         self._place_tables()
@@ -789,7 +781,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         plain = WHITE_FLOOR if values["hide_chessboard"] else BLUE_FLOOR
         alarm = RED_FLOOR if plain == BLUE_FLOOR and values["visual_feedback"] else plain
         s.rim[lanes] = values["black_background"]
-        s.calm[lanes], s.alarm[lanes] = (BLACK_FLOOR,) * 2 if values["black_background"] else (plain, alarm)
+        s.floors[lanes] = BLACK_FLOOR if values["black_background"] else (plain, alarm)
         s.darkness[lanes] = fading = _fading(values["light_dim_off_duration"], values["light_threshold"])
         # A rim is drawn like dimmed pixels are, so with rims the darkness is never just black.
         opaque = np.flatnonzero(fading == 255)
@@ -800,6 +792,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         # The original inserts the surfaces at places in a list that depend on each other.
         s.exit_layer[lanes] = (BELOW_BAR if coins else ABOVE_BAR) if exit_ else UNDER
         s.agent_layer[lanes] = (BELOW_BAR if coins and exit_ else ABOVE_BAR) if values["agent_visible"] else UNDER
+        s.layered[lanes] = exit_ or values["agent_visible"]
 
     def _settle(self) -> None:
         """Numbers the different figures and props of all lanes' options."""
@@ -816,6 +809,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         spots = lamps(int(min(radii)), int(max(radii)))
         self._art = Art(spots, self._wardrobe.sheet, props(self.scales), bars(self.variant.endless))
         self._controls = free_controls()
+        self._calm = np.arange(0, 2 * self.num_envs, 2)  # (N,) the scenery's calm rows
         self._lane_walk = (self.state.figure[:, None] + np.arange(2)) * (STRIDES * SPAN)  # (N, 2)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -830,20 +824,28 @@ class SearingSpotlights(MemoryGymVectorEnv):
         """Draws the lane's next level and starts its episode."""
         values = self.settings[lane]
         spawns = NO_LIMIT if self.variant.endless else _limit(values["num_spawns"])
-        write_level(self.state, lane, draw_level(rng, values, self.variant), spawns)
+        level = draw_level(rng, values, self.variant)
+        write_level(self.state, lane, level, spawns)
+        furnish(self.state, self._art, lane)
+        if not level.coins:
+            self._unlocked.append(lane)
 
     def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One step of the rules: walk, spawn, shine, burn, collect, leave."""
         s = self.state
         s.length += 1
         self._move(actions)
+        while self._unlocked:
+            lane = self._unlocked.pop()
+            s.is_open[lane] = s.left[lane] == 0
+            furnish(s, self._art, lane)
         s.wait -= 1
         due = s.wait == 0
         if np.count_nonzero(due):
             for lane in np.flatnonzero(due).tolist():
                 self._spawn(lane)
         hit = self._shine()
-        rewards, terminated, s.floor = s.reward_outside.copy(), np.zeros(self.num_envs, bool), s.calm.copy()
+        rewards, terminated, s.floor = s.reward_outside.copy(), np.zeros(self.num_envs, bool), self._calm.copy()
         if np.count_nonzero(hit):
             lanes = np.flatnonzero(hit)
             terminated[lanes] = dead = burn(s, lanes)
@@ -862,6 +864,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         action = actions[:, 0] * 3 + actions[:, 1]  # (N,)
         s.shown_action, s.last_action = s.last_action, action
         s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._wardrobe.walk)
+        s.look = s.facing.copy()
         np.subtract(s.pos.T, PAD, out=s.bodies[:, :, AGENT])
 
     def _spawn(self, lane: int) -> None:
@@ -908,6 +911,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
                 s.bodies[:, lane, COIN] = draw_coin(self._rngs[lane], last)
                 s.left[lane], s.coin_age[lane] = 1, 0
                 aim(s, lane)
+            furnish(s, self._art, lane)
 
     def _leave(self, touched: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
         """Ends the episodes whose agent stands at the open exit or, without one, has just taken the last coin."""
@@ -958,7 +962,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Lights everything below the bar, and circles the spotlights."""
         s, lanes = self.state, np.array([lane])
-        lit = scene(s, self._art, lanes, (s.bodies[0] != GONE)[lanes])
+        lit = scene(s, self._art, lanes)
         below = slice(BAR * DEBUG_ZOOM, None)
         frame[below] = magnify(lit.reshape(SCREEN, SCREEN, 3), DEBUG_ZOOM)[below]
         for slot in np.flatnonzero(s.place[0, lane]).tolist():
@@ -1004,9 +1008,3 @@ def _figures(values: dict[str, Any]) -> tuple[Figure, Figure]:
 
 def _scales(values: dict[str, Any]) -> tuple[float, float]:
     return values["coin_scale"], values.get("exit_scale", values["coin_scale"])
-
-
-def _extent(scale: float) -> float:
-    """How far the agent's body and hands reach from its centre, in pixels."""
-    hands = [math.hypot(*place) for facing in range(FACINGS) for place in hand_places(scale, facing)]
-    return max(radius_of(scale), max(hands) + int(10 * scale))
