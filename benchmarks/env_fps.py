@@ -32,6 +32,8 @@ ORIGINALS = {
     "MysteryPath-v0": ("mystery_path", "MysteryPathEnv"),
     "MysteryPath-Grid-v0": ("mystery_path_grid", "GridMysteryPathEnv"),
     "Endless-MysteryPath-v0": ("endless_mystery_path", "EndlessMysteryPathEnv"),
+    "SearingSpotlights-v0": ("searing_spotlights", "SearingSpotlightsEnv"),
+    "Endless-SearingSpotlights-v0": ("endless_searing_spotlights", "EndlessSearingSpotlightsEnv"),
 }
 COLUMNS = ["id", "memory-gym", "one", "ratio", "{n} lanes", "ratio", "reset, memory-gym", "reset", "ratio"]
 ACTIONS = 256  # sampled before the clock starts

@@ -9,11 +9,21 @@ from memory_gym_envs.base import MemoryGymVectorEnv
 from memory_gym_envs.mortar_mayhem import MortarMayhem
 from memory_gym_envs.mystery_path import MysteryPath
 from memory_gym_envs.options import Option, options_table
+from memory_gym_envs.searing_spotlights import SearingSpotlights
 from memory_gym_envs.single import MemoryGymEnv
 
-__all__ = ["IDS", "MemoryGymEnv", "MemoryGymVectorEnv", "MortarMayhem", "MysteryPath", "Option", "options_table"]
+__all__ = [
+    "IDS",
+    "MemoryGymEnv",
+    "MemoryGymVectorEnv",
+    "MortarMayhem",
+    "MysteryPath",
+    "Option",
+    "SearingSpotlights",
+    "options_table",
+]
 
-FAMILIES = (MortarMayhem, MysteryPath)
+FAMILIES = (MortarMayhem, MysteryPath, SearingSpotlights)
 IDS = tuple(variant for family in FAMILIES for variant in family.variants)
 
 for _family in FAMILIES:

@@ -25,6 +25,7 @@ class Option:
     kind: "bool", "int", "float" or "ints" (a list of integers, one of which is drawn at every reset).
     low, high: the allowed range, both ends included; None: no limit on that side.
     also: single values allowed besides the range.
+    empty: whether a list may have no entries.
     """
 
     name: str
@@ -34,12 +35,13 @@ class Option:
     high: float | None
     meaning: str
     also: tuple[int, ...] = ()
+    empty: bool = False
 
     @property
     def allowed(self) -> str:
         """The allowed values in words."""
         noun = {"bool": "true or false", "int": "an integer", "float": "a number", "ints": "a list of integers"}
-        text = noun[self.kind] + _range_text(self.low, self.high)
+        text = noun[self.kind] + _range_text(self.low, self.high) + (", possibly none" if self.empty else "")
         return " or ".join([*(str(value) for value in self.also), text])
 
     def parse(self, value: Any) -> Any:
@@ -47,7 +49,8 @@ class Option:
         if self.kind == "bool":
             return bool(value) if isinstance(value, (bool, np.bool_)) else None
         if self.kind == "ints":
-            if not isinstance(value, (list, tuple, np.ndarray)) or not 0 < len(value) <= LONGEST_LIST:
+            shortest = 0 if self.empty else 1
+            if not isinstance(value, (list, tuple, np.ndarray)) or not shortest <= len(value) <= LONGEST_LIST:
                 return None
             numbers_ = tuple(self._number(item, int) for item in value)
             return None if None in numbers_ else numbers_

@@ -1,19 +1,21 @@
 """Scripted players that see the state, for tests: they know the target and walk to it."""
 
+import gymnasium as gym
 import numpy as np
 
 import memory_gym_envs
-from memory_gym_envs import MysteryPath
+from memory_gym_envs import MysteryPath, SearingSpotlights
 from memory_gym_envs.mystery_path import EAST, WEST, tile_centres
+from memory_gym_envs.searing_spotlights import AGENT, COIN, EXIT, GONE
 
 TILE, SCREEN = 14, 84
 FAMILY = {env_id: family for family in memory_gym_envs.FAMILIES for env_id in family.variants}
 
 
-def choices(batch) -> int:
-    """How many values each branch of an action has."""
-    space = batch.single_action_space
-    return int(space.n) if hasattr(space, "n") else int(space.nvec[0])
+def choices(env) -> int:
+    """How many values an action, or each part of one, has."""
+    space = getattr(env, "single_action_space", env.action_space)
+    return int(space.nvec[0]) if isinstance(space, gym.spaces.MultiDiscrete) else int(space.n)
 
 
 def free_player(batch) -> np.ndarray:
@@ -62,8 +64,19 @@ def path_endless_player(batch) -> np.ndarray:
     return np.where(across == 2, 1, np.where(down > 0, down + 1, 0))
 
 
+def spot_player(batch) -> np.ndarray:
+    """(N, 2) actions straight to the first coin left, then to the exit, whatever the spotlights do."""
+    bodies = batch.state.bodies  # (2, N, B)
+    order = np.concatenate([bodies[:, :, COIN:], bodies[:, :, [EXIT, AGENT]]], axis=2)
+    first = np.argmax(order[0] != GONE, axis=1)  # (N,)
+    away = (np.take_along_axis(order, first[None, :, None], axis=2)[:, :, 0] - bodies[:, :, AGENT]).T  # (N, 2)
+    return np.where(away > 1, 2, np.where(away < -1, 1, 0))
+
+
 def player(batch) -> np.ndarray:
     """The right player for the batch."""
+    if isinstance(batch, SearingSpotlights):
+        return spot_player(batch)
     if isinstance(batch, MysteryPath) and batch.variant.endless:
         return path_endless_player(batch)
     free, grid = (path_free_player, path_grid_player) if isinstance(batch, MysteryPath) else (free_player, grid_player)

@@ -17,13 +17,16 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from players import FAMILY, choices, player, stumbling
 
 import memory_gym_envs
-from memory_gym_envs import IDS, MortarMayhem, MysteryPath, options_table
+from memory_gym_envs import IDS, MortarMayhem, MysteryPath, SearingSpotlights, options_table
 
 EACH = pytest.mark.parametrize("env_id", IDS)
+MORTAR = pytest.mark.parametrize("env_id", MortarMayhem.variants)
+SPOTLIGHTS = pytest.mark.parametrize("env_id", SearingSpotlights.variants)
 LANES = 4
 HASTY = {  # options that end episodes soon; the end of some earns -1
     MortarMayhem: {"explosion_delay": [2], "explosion_duration": (1,), "reward_command_failure": -1},
     MysteryPath: {"max_steps": 9, "reward_step": -1},
+    SearingSpotlights: {"agent_health": 1, "initial_spawns": 20, "reward_death": -1},
 }
 
 
@@ -224,7 +227,8 @@ def test_every_option_in_its_range(env_id):
         assert observations in envs.observation_space
         for observations, rewards, _, _, infos in roll(envs, 40):  # noqa: B007 - the last is used
             assert np.isfinite(rewards).all()
-            assert ((infos["ground_truth"] >= 0) & (infos["ground_truth"] <= 1)).all()
+            # A Searing Spotlights agent may start up to two pixels outside the screen.
+            assert ((infos["ground_truth"] >= 0) & (infos["ground_truth"] <= 86 / 84)).all()
         assert observations in envs.observation_space
 
 
@@ -236,7 +240,8 @@ def random_value(option, rng):
     if option.kind == "float":
         return float(rng.choice([low, high, rng.uniform(low, high)]))
     small = min(high, low + 12)
-    values = [int(rng.choice([low, rng.integers(low, small + 1)])) for _ in range(rng.integers(1, 4))]
+    shortest = 0 if option.empty else 1
+    values = [int(rng.choice([low, rng.integers(low, small + 1)])) for _ in range(rng.integers(shortest, 4))]
     return values if option.kind == "ints" else int(rng.choice([low, high if high <= 9 else small]))
 
 
@@ -272,7 +277,24 @@ WRONG_MYSTERY_PATH = [
     ({"reward_fall_off": float("inf")}, "'reward_fall_off'.*a number"),
     ({"show_origin": 0}, "'show_origin'.*true or false.*0"),
 ]
-WRONG = {MortarMayhem: WRONG_ANYWHERE + WRONG_MORTAR_MAYHEM, MysteryPath: WRONG_ANYWHERE + WRONG_MYSTERY_PATH}
+WRONG_SPOTLIGHTS = [
+    ({"agent_helth": 3}, "'agent_helth'.*'agent_health'.*an integer of at least 1"),
+    ({"agent_health": 0}, "'agent_health'.*an integer of at least 1.*0"),
+    ({"initial_spawns": 101}, "'initial_spawns'.*an integer from 0 to 100.*101"),
+    ({"spot_min_radius": 0.9}, "'spot_min_radius'.*a number from 1 to 42"),
+    ({"spot_max_speed": 1.01}, "'spot_max_speed'"),
+    ({"spot_damage": -1}, "'spot_damage'"),
+    ({"light_threshold": 256}, "'light_threshold'.*an integer from 0 to 255"),
+    ({"black_background": 1}, "'black_background'.*true or false"),
+    ({"coin_scale": 0.0}, "'coin_scale'.*a number from 0.1 to 2.0"),
+    ({"max_steps": 0}, "'max_steps'.*-1 or an integer of at least 1"),
+    ({"agent_speed": [3.0]}, "'agent_speed'"),
+]
+WRONG = {
+    MortarMayhem: WRONG_ANYWHERE + WRONG_MORTAR_MAYHEM,
+    MysteryPath: WRONG_ANYWHERE + WRONG_MYSTERY_PATH,
+    SearingSpotlights: WRONG_ANYWHERE + WRONG_SPOTLIGHTS,
+}
 WRONG_CASES = [
     pytest.param(env_id, *case, id=f"{env_id}-{str(case[0])[:40]}") for env_id in IDS for case in WRONG[FAMILY[env_id]]
 ]
@@ -318,6 +340,14 @@ def test_wrong_option_changes_nothing(env_id, options, message):
         ("Endless-MysteryPath-v0", {"cardinal_origin_choice": [0]}),
         ("Endless-MysteryPath-v0", {"camera_offset_scale": 5.6}),
         ("Endless-MysteryPath-v0", {"stamina_level": 0}),
+        ("SearingSpotlights-v0", {"steps_per_coin": 160}),
+        ("SearingSpotlights-v0", {"num_coins": [21]}),
+        ("SearingSpotlights-v0", {"num_coins": 1}),
+        ("SearingSpotlights-v0", {"coin_enabled": False}),
+        ("Endless-SearingSpotlights-v0", {"num_coins": [1]}),
+        ("Endless-SearingSpotlights-v0", {"use_exit": False}),
+        ("Endless-SearingSpotlights-v0", {"spawn_interval": 0}),
+        ("Endless-SearingSpotlights-v0", {"steps_per_coin": 0}),
     ],
 )
 def test_options_of_one_id_alone(env_id, options):
@@ -522,7 +552,7 @@ def test_render(env_id):
         assert np.array_equal(np.stack(frames), picture(observations))
 
 
-@pytest.mark.parametrize("env_id", MortarMayhem.variants)
+@MORTAR
 def test_debug_render_circles_the_target(env_id):
     env = gym.make(env_id, render_mode="debug_rgb_array").unwrapped
     observation, info = env.reset(seed=2)
@@ -580,6 +610,68 @@ def test_visual_feedback():
         assert seen == (12 if feedback else 0)  # two fires of six steps
 
 
+@SPOTLIGHTS
+def test_debug_render_lights_everything(env_id):
+    """Floor, agent, coin and exit show in the dark; green circles are where the agent's view is lit."""
+    env = gym.make(env_id, render_mode="debug_rgb_array").unwrapped
+    env.reset(seed=2, options={"spot_damage": 0, "light_dim_off_duration": 0})
+    for step in range(60):
+        observation, _, _, _, info = env.step([0, 0])
+        frame = env.render()
+        assert frame.shape == (336, 336, 3)
+        assert frame.dtype == np.uint8
+        view = observation.repeat(4, 0).repeat(4, 1)
+        assert np.array_equal(frame[:16], view[:16])  # the bar
+        circle = (frame == (0, 255, 0)).all(axis=-1)
+        circle[:16] = False
+        seen = (view[16:] > 0).any(axis=-1) & ~circle[16:]
+        assert np.array_equal(frame[16:][seen], view[16:][seen])
+        spot = env.batch.state.spot[:, 0]
+        on_screen = ((spot > 0) & (spot < 84)).all(axis=0).any()
+        assert not on_screen or circle.any()
+        for x, y in (info["ground_truth"] * 336).reshape(-1, 2):
+            thing = frame[round(y) - 4 : round(y) + 4, round(x) - 4 : round(x) + 4].reshape(-1, 3)
+            floor = {(255, 255, 255), (0, 0, 255), (255, 0, 0), (0, 255, 0)}
+            assert {tuple(pixel) for pixel in thing.tolist()} - floor, step
+
+
+def test_spotlights_show_what_they_light():
+    """With a black floor, only the agent, the coin, the exit and the white rims of spotlights can be seen."""
+    env = gym.make("SearingSpotlights-v0").unwrapped
+    options = {"black_background": True, "spot_damage": 0, "initial_spawns": 12, "light_dim_off_duration": 0}
+    env.reset(seed=3, options=options)
+    colors = set()
+    for _ in range(120):
+        observation, *_ = env.step([0, 0])
+        colors |= {tuple(pixel) for pixel in observation[4:].reshape(-1, 3).tolist()}
+    rim, body, hand, coin, door = (255, 255, 255), (250, 204, 153), (50, 50, 50), (255, 165, 0), (55, 55, 55)
+    assert colors <= {(0, 0, 0), rim, body, hand, coin, door}
+    assert colors >= {(0, 0, 0), rim, body}
+
+
+def test_nothing_painted_black_or_white_stays():
+    """In the original, black_background and hide_chessboard last for as long as the environment."""
+    env, fresh = gym.make("SearingSpotlights-v0"), gym.make("SearingSpotlights-v0")
+    for option in ("black_background", "hide_chessboard"):
+        first, _ = env.reset(seed=1, options={option: True})
+        assert not (first[4:] == (0, 0, 255)).all(axis=-1).any()
+        assert np.array_equal(env.reset(seed=2)[0], fresh.reset(seed=2)[0])
+
+
+@SPOTLIGHTS
+def test_visible_in_the_dark(env_id):
+    """What the options make visible is drawn over the darkness, every step."""
+    names = ["agent_visible", "coins_visible"] + ["exit_visible"] * ("Endless" not in env_id)
+    env = gym.make(env_id).unwrapped
+    env.reset(seed=4, options={**dict.fromkeys(names, True), "initial_spawns": 0})
+    for _ in range(30):
+        observation, _, over, _, _ = env.step([0, 0])
+        colors = {tuple(pixel) for pixel in observation[4:].reshape(-1, 3).tolist()}
+    assert not over
+    assert colors >= {(0, 0, 0), (250, 204, 153), (255, 165, 0)}
+    assert ((55, 55, 55) in colors) == ("exit_visible" in names)
+
+
 def test_needs_neither_pygame_nor_torch():
     """The package imports NumPy and Gymnasium only."""
     code = "import sys, memory_gym_envs; print([m for m in ('pygame', 'torch', 'memory_gym') if m in sys.modules])"
@@ -598,5 +690,7 @@ def test_ids():
         "MysteryPath-v0",
         "MysteryPath-Grid-v0",
         "Endless-MysteryPath-v0",
+        "SearingSpotlights-v0",
+        "Endless-SearingSpotlights-v0",
     }
     assert all(env_id in gym.registry for env_id in memory_gym_envs.IDS)

@@ -6,7 +6,7 @@ import pytest
 from players import FAMILY, stumbling
 
 import memory_gym_envs
-from memory_gym_envs import MortarMayhem, MysteryPath
+from memory_gym_envs import MortarMayhem, MysteryPath, SearingSpotlights
 
 LANES = 5
 OPTIONS = {
@@ -19,10 +19,13 @@ OPTIONS = {
     "MysteryPath-Grid-v0": {"max_steps": 30, "reward_path_progress": 0.1, "show_goal": True},
     "Endless-MysteryPath-v0": {"stamina_level": 15, "show_stamina": True, "show_background": True, "agent_speed": 4.6}
     | {"camera_offset_scale": 2.3},
+    "SearingSpotlights-v0": {"num_coins": [0, 2, 4], "coin_scale": 0.6, "initial_spawns": 10, "black_background": True},
+    "Endless-SearingSpotlights-v0": {"steps_per_coin": 40, "light_threshold": 150, "agent_visible": True},
 }
 CHANGED = {
     MortarMayhem: {"explosion_delay": [9], "agent_scale": 0.5},
     MysteryPath: {"reward_step": -0.5, "agent_scale": 0.4},
+    SearingSpotlights: {"spot_min_radius": 2.0, "spot_max_radius": 30, "initial_spawns": 9, "agent_scale": 0.5},
 }
 
 

@@ -212,7 +212,7 @@ LANE_OPTIONS = {
 }
 
 
-@pytest.mark.parametrize("env_id", memory_gym_envs.IDS)
+@pytest.mark.parametrize("env_id", [env_id for env_id in memory_gym_envs.IDS if FAMILY[env_id] in LANE_OPTIONS])
 def test_players_in_lanes(env_id):
     """The same returns with automatic resets, several episodes a lane."""
     envs, endless = gym.make_vec(env_id, num_envs=LANES), "Endless" in env_id

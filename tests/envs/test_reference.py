@@ -13,7 +13,7 @@ import pytest
 from players import FAMILY
 
 import memory_gym_envs
-from memory_gym_envs import MortarMayhem, MysteryPath
+from memory_gym_envs import MortarMayhem, MysteryPath, SearingSpotlights
 
 FOLDER = Path(os.environ.get("REFERENCE_TRACES") or Path(__file__).resolve().parents[1] / "data")
 FILES = sorted(path for path in FOLDER.glob("*.npz") if path.name.split(".")[0] in memory_gym_envs.IDS)
@@ -22,6 +22,7 @@ LANES, LANE = 3, 1
 OTHER_LANES = {
     MortarMayhem: {"agent_scale": 0.5, "explosion_delay": [5]},
     MysteryPath: {"agent_scale": 0.4, "max_steps": 50},
+    SearingSpotlights: {"agent_scale": 0.5, "initial_spawns": 9},
 }
 
 

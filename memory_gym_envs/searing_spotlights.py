@@ -1,0 +1,1010 @@
+"""Searing Spotlights: stay out of the light, remember where you are, collect coins and leave (thesis 4.5).
+
+Shape letters: N lanes, n some of them, S spotlights that fit, B bodies: the agent, the exit and the coins that fit.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from memory_gym_envs.base import ALL, DEBUG_ZOOM, MemoryGymVectorEnv
+from memory_gym_envs.character import (
+    FACINGS,
+    PAD,
+    SPAN,
+    STRIDES,
+    Figure,
+    free_controls,
+    radius_of,
+    walk,
+    wardrobe,
+)
+from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, disk, magnify, make_sheet, paste, ring
+from memory_gym_envs.options import Option
+
+TILE = 12  # pixels; the floor is a chessboard
+BAR = 4  # rows of the top bar
+MIDDLE = SCREEN // 2
+OUTSIDE = math.sqrt(2 * SCREEN**2) / 2  # a spotlight starts and ends that far from the middle, and its radius more
+MARGIN = 7  # coins and the exit stay that far from the screen's edges
+AGENT_SPACE, COIN_SPACE = 28, 21  # pixels around a place where nothing else is put
+SPOT_RADII = (1, 42)  # pixels; the largest light is as wide as the screen
+MOST_COINS = 20
+
+AGENT, EXIT, COIN = 0, 1, 2  # bodies; coins are the last ones
+GONE = 1000  # where bodies are that do not exist, in pixels
+AWAY = -1000  # where spotlights are that do not exist
+
+# What is known of a spotlight, a row of State.spots. Its place at time t is START + t * (TOWARD + t * BEND).
+TIME, SPEED, RADIUS, REACH = range(4)
+START, TOWARD, BEND = slice(4, 6), slice(6, 8), slice(8, 10)
+NO_SPOT = np.array([0.0, 0.0, 0.0, -1.0, AWAY, AWAY, 0.0, 0.0, 0.0, 0.0])  # (10,)
+
+PLACES, PLACE_0 = 256, 64  # spotlights are at -64 .. 191 on both axes
+NO_KEY = -AWAY  # brings a spotlight that does not exist to place 0
+
+NO_LIMIT = np.iinfo(np.int64).max
+
+
+# ---- configuration ----
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What tells one Searing Spotlights id from another."""
+
+    endless: bool  # one coin after the other, no exit
+    render_fps: int
+    options: tuple[Option, ...]
+
+
+def _options(endless: bool) -> tuple[Option, ...]:
+    """The reset options of an id, in the original's order of names."""
+    finite, (small, large) = not endless, SPOT_RADII
+    unused, least = "ignored, as in the original", "; {} where that is larger"
+    steps, deadline = "steps until truncation; -1: no limit", "steps to collect a coin in; -1: no limit"
+    rows = [
+        (True, Option("max_steps", -1 if endless else 256, "int", 1, None, steps, also=(-1,))),
+        (endless, Option("steps_per_coin", 160, "int", 1, None, deadline, also=(-1,))),
+        (True, Option("initial_spawns", 3 if endless else 4, "int", 0, 100, "spotlights at the start")),
+        (finite, Option("num_spawns", 30, "int", 0, None, "spotlights that follow")),
+        (finite, Option("initial_spawn_interval", 30, "int", 0, None, "steps between them, but for the next")),
+        (finite, Option("spawn_interval_threshold", 10, "int", 0, None, "steps added to those")),
+        (finite, Option("spawn_interval_decay", 0.95, "float", 0.0, 1.0, unused)),
+        (endless, Option("spawn_interval", 50, "int", 1, None, "steps between the spotlights that follow")),
+        (True, Option("spot_min_radius", 7.5, "float", small, large, "smallest radius of a spotlight, rounded down")),
+        (True, Option("spot_max_radius", 13.75, "float", small, large, "largest" + least.format("the smallest"))),
+        (True, Option("spot_min_speed", 0.0025, "float", 0.0, 1.0, "slowest spotlight, in passages a step")),
+        (True, Option("spot_max_speed", 0.0075, "float", 0.0, 1.0, "fastest" + least.format("the slowest"))),
+        (True, Option("spot_damage", 1.0, "float", 0.0, None, "health lost in a step in the light")),
+        (True, Option("visual_feedback", True, "bool", None, None, "redden the floor while the agent is in the light")),
+        (True, Option("black_background", False, "bool", None, None, "black floor; spotlights have a white rim")),
+        (True, Option("hide_chessboard", False, "bool", None, None, "white floor, which never reddens")),
+        (True, Option("light_dim_off_duration", 6, "int", 0, 255, "steps in which the light goes out; 0: it is out")),
+        (True, Option("light_threshold", 255, "int", 0, 255, "darkness that dimming goes on until; 255: black")),
+        (finite, Option("num_coins", (1,), "ints", 0, MOST_COINS, "coins to collect *", empty=True)),
+        (True, Option("coin_scale", 0.375, "float", 0.1, 2.0, "size of a coin; 0.375: 6 pixels wide")),
+        (endless, Option("coin_show_duration", 6, "int", 0, None, "steps that a new coin is visible in the dark")),
+        (True, Option("coins_visible", False, "bool", None, None, "coins are visible in the dark")),
+        (endless, Option("coin_enabled", True, "bool", None, None, "false: no coins, and no time limit for them")),
+        (finite, Option("use_exit", True, "bool", None, None, "false: the last coin ends the episode")),
+        (finite, Option("exit_scale", 0.5, "float", 0.1, 2.0, "size of the exit; 0.5: 10 pixels wide")),
+        (finite, Option("exit_visible", False, "bool", None, None, "the exit is visible in the dark")),
+        (True, Option("agent_speed", 3.0, "float", 0.0, 84.0, "pixels that the agent walks in a step")),
+        (True, Option("agent_health", 10 if endless else 5, "int", 1, None, "health at the start")),
+        (True, Option("agent_scale", 0.25, "float", 0.04, 1.0, "size of the agent; 0.25: 12 pixels wide")),
+        (True, Option("agent_visible", False, "bool", None, None, "the agent is visible in the dark")),
+        (True, Option("sample_agent_position", True, "bool", None, None, "false: the agent starts in the middle")),
+        (True, Option("show_last_action", True, "bool", None, None, "show the action before the last in the top bar")),
+        (True, Option("show_last_positive_reward", True, "bool", None, None, "show whether the step before paid")),
+        (True, Option("reward_inside_spotlight", 0.0, "float", None, None, "reward for each step in the light")),
+        (True, Option("reward_outside_spotlight", 0.0, "float", None, None, "reward for each step in the dark")),
+        (True, Option("reward_death", 0.0, "float", None, None, "added when no health is left")),
+        (finite, Option("reward_exit", 1.0, "float", None, None, "reward for leaving")),
+        (finite, Option("reward_max_steps", 0.0, "float", None, None, unused)),
+        (True, Option("reward_coin", 0.25, "float", None, None, "reward for each coin")),
+    ]
+    return tuple(option for present, option in rows if present)
+
+
+VARIANTS = {
+    "SearingSpotlights-v0": Variant(False, 25, _options(endless=False)),
+    "Endless-SearingSpotlights-v0": Variant(True, 25, _options(endless=True)),
+}
+
+
+# ---- state ----
+
+
+@dataclass
+class State:
+    """One array a field. The agent's pos is stored with PAD added, like in the other families."""
+
+    pos: np.ndarray  # (N, 2) the agent's centre, x and y
+    facing: np.ndarray  # (N,)
+    look: np.ndarray  # (N,) the facing that is drawn
+    figure: np.ndarray  # (N,) which of the batch's figures the agent is
+    bodies: np.ndarray  # (2, N, B) x and y of the agent, the exit and the coins; GONE where there is none
+    touch: np.ndarray  # (N, B) float64: square of the distance at which the agent touches them
+    props: np.ndarray  # (N,) the row of the props' sheet with the lane's coin; its closed and its open exit follow
+    is_open: np.ndarray  # (N,) 1 if the exit is open
+    goal: np.ndarray  # (N, 4) float64: x and y of the first coin left and of the exit; 0 where there is none
+    coins: np.ndarray  # (N,) in this episode
+    left: np.ndarray  # (N,) of them
+    collected: np.ndarray  # (N,) coins so far
+    coin_age: np.ndarray  # (N,) steps since the coin appeared (endless)
+    success: np.ndarray  # (N,) 1 when the task is done
+    spots: np.ndarray  # (10, N, S) float64: the spotlights, oldest first; see TIME .. BEND
+    spot_key: np.ndarray  # (N, S) where the radius begins in the lamps' tables, with PLACE_0 added; or NO_KEY
+    count: np.ndarray  # (N,) spotlights
+    spot: np.ndarray  # (2, N, S) float64: x and y where each one shines; AWAY where it doesn't
+    place: np.ndarray  # (2, N, S) the same as indices of the lamps' tables; 0 where it doesn't
+    wait: np.ndarray  # (N,) steps until the next one
+    spawns: np.ndarray  # (N,) spotlights to follow
+    health: np.ndarray  # (N,) float64
+    scenery: np.ndarray  # (2 * N, FRAME) uint8: each lane's floor, coins and exit in full light: calm, then alarmed
+    floor: np.ndarray  # (N,) which row of the scenery shows
+    red: np.ndarray  # (N,) pixels of the top bar that show lost health
+    last_action: np.ndarray  # (N,) 3 * horizontal + vertical
+    shown_action: np.ndarray  # (N,) that of the step before
+    last_gain: np.ndarray  # (N,) 1, or 2 after a positive reward
+    shown_gain: np.ndarray  # (N,) that of the step before; 0 before the first step
+    length: np.ndarray  # (N,) steps so far
+    returned: np.ndarray  # (N,) float64: sum of rewards so far
+    # Options that the rules or the pictures need at every step.
+    limit: np.ndarray  # (N,) steps until truncation
+    coin_limit: np.ndarray  # (N,) steps to collect a coin in
+    coin_show: np.ndarray  # (N,) age until which coins are visible in the dark
+    interval: np.ndarray  # (N,) steps between spotlights
+    full: np.ndarray  # (N,) float64: health at the start
+    damage: np.ndarray  # (N,) float64
+    floors: np.ndarray  # (N, 2) rows of floors(): while the agent is in the dark, and in the light
+    rim: np.ndarray  # (N,) bool: spotlights have a white rim
+    darkness: np.ndarray  # (N, FADE) uint8: opacity of the dark after so many steps
+    dark_at: np.ndarray  # (N,) steps until it is opaque and nothing else
+    senses: np.ndarray  # (N,) the first row of bars() that shows what the lane may see
+    exit_layer: np.ndarray  # (N,) UNDER the dark, or above it and BELOW_BAR or ABOVE_BAR
+    agent_layer: np.ndarray  # (N,) likewise
+    layered: np.ndarray  # (N,) bool: either is above the dark
+    reward_inside: np.ndarray  # (N,) float64
+    reward_outside: np.ndarray  # (N,) float64
+    reward_death: np.ndarray  # (N,) float64
+    reward_coin: np.ndarray  # (N,) float64
+    reward_exit: np.ndarray  # (N,) float64
+
+
+UNDER, BELOW_BAR, ABOVE_BAR = range(3)
+FADE = 257  # steps after which the darkness no longer changes
+
+
+def empty_state(lanes: int) -> State:
+    """The state of N lanes before their first reset, with room for no coin and one spotlight."""
+    shapes = {"pos": (lanes, 2), "bodies": (2, lanes, COIN), "touch": (lanes, COIN)}
+    shapes |= {"goal": (lanes, 4), "spots": (len(NO_SPOT), lanes, 1), "spot_key": (lanes, 1), "darkness": (lanes, FADE)}
+    shapes |= dict.fromkeys(("spot", "place"), (2, lanes, 1)) | {"scenery": (2 * lanes, FRAME), "floors": (lanes, 2)}
+    floats = ("touch", "goal", "spots", "spot", "health", "returned", "full", "damage")
+    rewards = ("reward_inside", "reward_outside", "reward_death", "reward_coin", "reward_exit")
+    kinds = (
+        dict.fromkeys((*floats, *rewards), np.float64)
+        | {"rim": bool, "layered": bool}
+        | dict.fromkeys(("darkness", "scenery"), np.uint8)
+    )
+    names = State.__dataclass_fields__
+    return State(**{name: np.zeros(shapes.get(name, (lanes,)), kinds.get(name, np.int64)) for name in names})
+
+
+def widened(array: np.ndarray, width: int, filler: float = 0) -> np.ndarray:
+    """The same array with room for at least `width` along its last axis."""
+    missing = width - array.shape[-1]
+    if missing <= 0:
+        return array
+    return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, missing)], constant_values=filler)
+
+
+def make_room(s: State, coins: int = 0, spots: int = 0) -> None:
+    """Widens the state's arrays, where they are too narrow, for so many coins and spotlights in a lane."""
+    s.bodies, s.touch = widened(s.bodies, COIN + coins, GONE), widened(s.touch, COIN + coins)
+    old = s.spot_key.shape[1]
+    if spots > old:
+        s.spots, s.spot_key = widened(s.spots, spots), widened(s.spot_key, spots, NO_KEY)
+        s.spots[:, :, old:] = NO_SPOT[:, None, None]
+        s.spot, s.place = widened(s.spot, spots, AWAY), widened(s.place, spots)
+
+
+# ---- levels ----
+
+
+class Level(NamedTuple):
+    """What the generator decides at a reset."""
+
+    facing: int
+    pos: tuple[int, int]
+    spots: list[list[float]]  # each a column of State.spots
+    coins: list[tuple[int, int]]
+    exit: tuple[int, int] | None
+
+
+def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
+    """Draws a level in the original's order, so that its seeds mean the same here."""
+    facing = int(rng.integers(ZERO, EIGHT))
+    if values["sample_agent_position"]:
+        pos, free = draw_place(rng, None, AGENT_SPACE)
+    else:
+        pos = (MIDDLE, MIDDLE)
+        free = occupied(None, pos, COIN_SPACE)
+    spots = [draw_spot(rng, values) for _ in range(values["initial_spawns"])]
+    if variant.endless:
+        return Level(facing, pos, spots, [draw_coin(rng, None)] if values["coin_enabled"] else [], None)
+    things = []
+    for _ in range(_pick(rng, values["num_coins"]) + values["use_exit"]):
+        place, free = draw_place(rng, free, COIN_SPACE)
+        things.append(inside(place))
+    return Level(facing, pos, spots, things, things.pop() if values["use_exit"] else None)
+
+
+# Arrays without dimensions: the generator takes them faster than numbers, and draws the same.
+ZERO, TWO, FOUR, EIGHT, TURN, EVERYWHERE = (np.array(number) for number in (0, 2, 4, 8, 360, SCREEN * SCREEN))
+RADII = [np.array(radius) for radius in range(SPOT_RADII[1] + 2)]
+ASIDE, ASKEW = (np.array(-45), np.array(45)), (np.array(-135), np.array(135))
+
+
+def draw_place(rng: np.random.Generator, free: np.ndarray | None, space: int) -> tuple[tuple[int, int], np.ndarray]:
+    """A place near a free pixel, and what is free when the pixels around that one are occupied.
+
+    free: (84, 84) bool, or None: every pixel is.
+    """
+    cells = None if free is None else np.flatnonzero(free)
+    if cells is None or not cells.size:  # where nothing is free, the original fails
+        cell = int(rng.integers(ZERO, EVERYWHERE))
+    else:
+        cell = int(cells[rng.integers(0, cells.size)])
+    y, x = divmod(cell, SCREEN)
+    return (x + int(rng.integers(TWO, FOUR)), y + int(rng.integers(TWO, FOUR))), occupied(free, (x, y), space)
+
+
+def occupied(free: np.ndarray | None, pos: tuple[int, int], space: int) -> np.ndarray:
+    """What is free when the pixels less than `space` away are not. free: (84, 84) bool, or None: every pixel is."""
+    left, top = SCREEN - 1 - pos[0], SCREEN - 1 - pos[1]
+    rest = _distant(space)[top : top + SCREEN, left : left + SCREEN]
+    return rest if free is None else free & rest
+
+
+@cache
+def _distant(space: int) -> np.ndarray:
+    """(167, 167) bool: which pixels are at least `space` away from the central one."""
+    offset = np.arange(1 - SCREEN, SCREEN)
+    return offset**2 + offset[:, None] ** 2 >= space**2
+
+
+def inside(pos: tuple[int, int]) -> tuple[int, int]:
+    """The place, moved inside the screen's margin."""
+    x, y = (min(max(part, MARGIN), SCREEN - MARGIN) for part in pos)
+    return x, y
+
+
+def draw_coin(rng: np.random.Generator, last: tuple[int, int] | None) -> tuple[int, int]:
+    """The endless task's next coin, away from the last one. It may lie under the agent, as in the original."""
+    free = None if last is None else occupied(None, last, AGENT_SPACE)
+    return inside(draw_place(rng, free, AGENT_SPACE)[0])
+
+
+def draw_spot(rng: np.random.Generator, values: dict[str, Any]) -> list[float]:
+    """A new spotlight, a column of State.spots: on a bent path from one side of the screen to roughly the other."""
+    least, slowest = values["spot_min_radius"], values["spot_min_speed"]
+    radius = int(rng.integers(RADII[int(least)], RADII[int(max(least, values["spot_max_radius"])) + 1]))
+    speed = rng.uniform(slowest, max(slowest, values["spot_max_speed"]))
+    start = int(rng.integers(ZERO, TURN))
+    target = start + 180 + int(rng.integers(ASIDE[0], ASIDE[1]))
+    offset = target + int(rng.integers(ASKEW[0], ASKEW[1]))
+    far = OUTSIDE + radius
+    x, y = (MIDDLE + far * part for part in UNITS[start])
+    to_x, to_y = (MIDDLE + far * part for part in UNITS[target])
+    off_x, off_y = (MIDDLE + far * part for part in UNITS[offset])
+    reach = (radius + radius_of(values["agent_scale"])) ** 2
+    return [0.0, speed, radius, reach, x, y, to_x - x, to_y - y, off_x - to_x, off_y - to_y]
+
+
+def _unit(degrees: int) -> tuple[float, float]:
+    """The direction of an angle; quarter turns are exact."""
+    if degrees % 90 == 0:
+        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[degrees // 90 % 4]
+    angle = math.fmod(degrees * math.pi / 180, 2 * math.pi)
+    return math.cos(angle), math.sin(angle)
+
+
+UNITS = [_unit(degrees) for degrees in range(720)]
+
+
+def _pick(rng: np.random.Generator, values: tuple[int, ...]) -> int:
+    """What Generator.choice would pick, 0 of no values. It draws nothing from a single value."""
+    if not values:
+        return 0
+    return values[0] if len(values) == 1 else values[int(rng.integers(0, len(values)))]
+
+
+def write_level(s: State, lane: int, level: Level, spawns: int) -> None:
+    """Starts the lane's episode at this level, with so many spotlights to follow."""
+    coins = len(level.coins)
+    make_room(s, spots=len(level.spots))
+    # Before the first step the agent is drawn facing up wherever it faces, as in the original.
+    s.facing[lane], s.look[lane] = level.facing, 0
+    s.bodies[:, lane] = GONE
+    s.bodies[:, lane, AGENT] = level.pos
+    for axis in range(2):
+        s.pos[lane, axis] = level.pos[axis] + PAD
+    for coin, place in enumerate(level.coins):
+        s.bodies[:, lane, COIN + coin] = place
+    s.goal[lane] = 0.0
+    if level.exit is not None:
+        s.bodies[:, lane, EXIT] = s.goal[lane, 2:] = level.exit
+    s.coins[lane] = s.left[lane] = coins
+    aim(s, lane)
+    s.spots[:, lane], s.spot_key[lane], s.count[lane] = NO_SPOT[:, None], NO_KEY, len(level.spots)
+    if level.spots:
+        s.spots[:, lane, : len(level.spots)] = np.array(level.spots).T
+        s.spot_key[lane, : len(level.spots)] = [spot[RADIUS] * PLACES + PLACE_0 for spot in level.spots]
+    s.spot[:, lane], s.place[:, lane] = AWAY, 0  # they shine from the first step on
+    s.spawns[lane], s.wait[lane] = spawns, s.interval[lane] if spawns else NO_LIMIT
+    s.health[lane] = s.full[lane]
+    s.floor[lane] = 2 * lane
+    for field in (s.collected, s.coin_age, s.success, s.is_open, s.red, s.length):
+        field[lane] = 0
+    s.last_action[lane] = s.shown_action[lane] = s.shown_gain[lane] = 0
+    s.last_gain[lane], s.returned[lane] = 1, 0.0
+
+
+def add_spot(s: State, lane: int, spot: list[float]) -> None:
+    """Adds a spotlight to the lane's."""
+    at = int(s.count[lane])
+    if at == s.spot_key.shape[1]:
+        make_room(s, spots=at + 2)
+    s.spots[:, lane, at] = spot
+    s.spot_key[lane, at] = spot[RADIUS] * PLACES + PLACE_0
+    s.count[lane] = at + 1
+
+
+def aim(s: State, lane: int) -> None:
+    """Makes the first coin left the lane's goal."""
+    coins = np.flatnonzero(s.bodies[0, lane, COIN:] != GONE)
+    s.goal[lane, :2] = s.bodies[:, lane, COIN + coins[0]] if coins.size else 0.0
+
+
+# ---- drawing ----
+
+WHITE, BLUE, RED = (255, 255, 255), (0, 0, 255), (255, 0, 0)
+YELLOW, ORANGE, GREEN = (255, 255, 0), (255, 165, 0), (0, 255, 0)
+DOOR_OPEN, DOOR_CLOSED = (48, 141, 70), (55, 55, 55)
+GREY = (50, 50, 50)
+ACTION_COLORS = ((120, 120, 120), (116, 1, 113), (255, 94, 14))  # nothing, left or up, right or down
+BLUE_FLOOR, RED_FLOOR, WHITE_FLOOR, BLACK_FLOOR = range(4)
+
+# Which pixels are lit is kept as bits: an item of 14 pixels, 6 items a row, 504 a frame.
+ITEM = 14
+ITEMS = SCREEN // ITEM
+BITS = 1 << np.arange(ITEM, dtype=np.uint16)
+
+
+@cache
+def floors() -> np.ndarray:
+    """(4, FRAME) uint8, read-only: the four floors, lit."""
+    tile = np.arange(SCREEN) // TILE
+    light = (tile[:, None] + tile) % 2 == 0  # (84, 84)
+    table = np.zeros((4, SCREEN, SCREEN, 3), np.uint8)
+    table[:BLACK_FLOOR] = WHITE
+    table[BLUE_FLOOR, ~light], table[RED_FLOOR, ~light] = BLUE, RED
+    table = table.reshape(4, FRAME)
+    table.flags.writeable = False
+    return table
+
+
+WIDTHS = SCREEN + 1  # of lost health in the top bar: a last hit may reach beyond the bar's half
+SENSES = 3 * 3 * 3 * WIDTHS  # rows of bars() for one choice of what to show
+
+
+@cache
+def bars(endless: bool) -> np.ndarray:
+    """(4 * SENSES, ROW) uint8, read-only: the top bar, by what it shows, both actions, last gain and lost health.
+
+    What it shows: 1 for actions + 2 for positive rewards. Last gain: 0 before the first step, 1, 2 for a positive one.
+    """
+    half, quarter = SCREEN // 2, SCREEN // 4
+    table = np.zeros((2, 2, 3, 3, 3, WIDTHS, SCREEN, 3), np.uint8)
+    table[:] = (0, 0, 0) if endless else GREY
+    table[..., :half, :] = GREEN
+    for action, color in enumerate(ACTION_COLORS):
+        table[:, 1, action, :, :, :, half : half + quarter] = color
+        table[:, 1, :, action, :, :, half + quarter :] = color
+    for width in range(WIDTHS):
+        table[..., width, :width, :] = RED
+    for gain, color in ((1, GREY), (2, YELLOW)):
+        table[1, 0, :, :, gain, :, half:] = color
+        table[1, 1, :, :, gain, :, half + 15 : half + 25] = color
+    table = table.reshape(-1, ROW)
+    table.flags.writeable = False
+    return table
+
+
+class Lamps(NamedTuple):
+    """Every spotlight at every place as bits, ready to be laid over each other.
+
+    A picture is a window of 84 rows on a long tape, on which each disk stands between 84 dark rows, once for every x.
+    """
+
+    column: np.ndarray  # (radii * PLACES,) where on the tape the disk starts, for every radius and x
+    row: np.ndarray  # (radii * PLACES,) how far from there the window starts, for every radius and y
+    disks: np.ndarray  # (rows,) windows that start at each row of the tape, as one item each
+    rims: np.ndarray  # (rows,) likewise, the disks' outlines
+
+
+@lru_cache(maxsize=8)
+def lamps(least: int, largest: int) -> Lamps:
+    """The tables for spotlights of these radii. Cached: environments with the same options share them."""
+    column = np.full((largest + 1, PLACES), SCREEN)  # the tape begins with a window that stays dark whatever the row
+    row = np.zeros((largest + 1, PLACES), np.int64)
+    tapes = [[np.zeros((4 * SCREEN, ITEMS), np.uint16)] for _ in range(2)]
+    places, end = np.arange(PLACES) - PLACE_0, 4 * SCREEN
+    for radius in range(least, largest + 1):
+        width = 2 * radius
+        seen = (places > -radius) & (places < SCREEN + radius)
+        column[radius, seen] = end + (width + SCREEN) * (places[seen] + radius - 1)
+        row[radius] = (radius - places).clip(-SCREEN, width)
+        tapes[0].append(_tape(disk(width, radius, radius, radius)))
+        tapes[1].append(_tape(ring(width, radius, radius, radius, 1)))
+        end += len(tapes[0][-1])
+    return Lamps(column.reshape(-1), row.reshape(-1), *(_windows(np.concatenate(tape)) for tape in tapes))
+
+
+def _tape(shape: np.ndarray) -> np.ndarray:
+    """(rows, ITEMS) uint16: a (W, W) mask at every x where any of it is on the screen, each before 84 dark rows."""
+    wide = np.pad(shape, ((0, 0), (SCREEN - 1, SCREEN - 1)))
+    cut = np.lib.stride_tricks.sliding_window_view(wide, SCREEN, axis=1)[:, ::-1]  # (W, X, 84), from left to right
+    bits = cut.reshape(*cut.shape[:2], ITEMS, ITEM) @ BITS  # (W, X, ITEMS)
+    return np.pad(bits.transpose(1, 0, 2), ((0, 0), (0, SCREEN), (0, 0))).reshape(-1, ITEMS)
+
+
+def _windows(tape: np.ndarray) -> np.ndarray:
+    """Every window of 84 rows, by its first row: one item each, a view."""
+    window = np.dtype(f"V{2 * ITEMS * SCREEN}")
+    return np.ndarray((len(tape) - SCREEN + 1,), window, tape, 0, (2 * ITEMS,))
+
+
+@cache
+def _pixels() -> np.ndarray:
+    """(2**ITEM,) items of 42 bytes: 255 where a bit is set."""
+    bits = (np.arange(1 << ITEM)[:, None] >> np.arange(ITEM)) & 1
+    return (bits.astype(np.uint8) * np.uint8(255)).repeat(3, axis=1).view(f"V{3 * ITEM}")[:, 0]
+
+
+def pixels(bits: np.ndarray) -> np.ndarray:
+    """Bits of frames, (n, 504) uint16, as a mask for frames: (n, FRAME) uint8, 255 where set."""
+    return _pixels().take(bits).view(np.uint8)
+
+
+@lru_cache(maxsize=16)
+def props(scales: tuple[tuple[float, float], ...]) -> Sheet:
+    """The sprites of coins and exits of the given pairs of scales: a coin, a closed exit and an open one for each."""
+    width = 2 * max(int(10 * scale) for pair in scales for scale in pair) + 2
+    images = np.zeros((3 * len(scales), width, width, 3), np.uint8)
+    solids = np.zeros(images.shape[:3], bool)
+    for index, (coin_scale, exit_scale) in enumerate(scales):
+        _draw_coin(images[3 * index], solids[3 * index], coin_scale)
+        for look, color in enumerate((DOOR_CLOSED, DOOR_OPEN)):
+            _draw_exit(images[3 * index + 1 + look], solids[3 * index + 1 + look], exit_scale, color)
+    return make_sheet(images, solids, np.arange(SCREEN))
+
+
+def _draw_coin(image: np.ndarray, solid: np.ndarray, scale: float) -> None:
+    middle, radius, rim = len(solid) // 2, int(10 * scale), int(2 * scale)
+    solid |= disk(len(solid), middle, middle, radius)
+    image[solid] = YELLOW
+    # A line of no width fills the circle: small coins are orange all over.
+    image[ring(len(solid), middle, middle, radius, rim) if rim else solid] = ORANGE
+
+
+def _draw_exit(image: np.ndarray, solid: np.ndarray, scale: float, color: tuple[int, int, int]) -> None:
+    size, corner, frame = int(20 * scale), int(10 * scale), int(2 * scale)
+    first = len(solid) // 2 - size // 2
+    square = slice(first, first + size)
+    arch, door = _arch(size, corner), np.zeros((size, size), bool)
+    if frame == 1:
+        door[:-1, 1:-1] = arch[:-1, 1:-1]
+        door[0] = False
+        line = ring(2 * corner, corner, corner, corner, 1)[:corner]
+        door[:corner, :corner] &= ~line[:, :corner]
+        door[:corner, size - corner :] &= ~line[:, corner:]
+    elif frame:  # a frame of no width fills the exit: small ones are black, open or not
+        door[frame:-frame, frame:-frame] = _arch(size - 2 * frame, max(0, corner - frame))
+    solid[square, square] = arch
+    image[square, square][door] = color
+
+
+def _arch(size: int, corner: int) -> np.ndarray:
+    """A square mask with round corners at the top."""
+    mask = np.ones((size, size), bool)
+    quarter = disk(2 * corner, corner, corner, corner)[:corner]
+    mask[:corner, :corner], mask[:corner, size - corner :] = quarter[:, :corner], quarter[:, corner:]
+    return mask
+
+
+class Art(NamedTuple):
+    """The tables that pictures are made of."""
+
+    lamps: Lamps
+    figures: Sheet
+    props: Sheet
+    bars: np.ndarray
+
+
+def draw(s: State, art: Art, lanes: np.ndarray | slice) -> np.ndarray:
+    """Fresh frames of the lanes, (n, 84, 84, 3) uint8, from the state alone."""
+    frames = scene(s, art, lanes)
+    lit, rim = shine(s, art.lamps, lanes)
+    darken(s, lanes, frames, pixels(lit), rim)
+    coins = s.coin_age[lanes] < s.coin_show[lanes]
+    if np.count_nonzero(coins):
+        put_coins(s, art, lanes, frames, coins)
+    layered = np.count_nonzero(s.layered[lanes])
+    if layered:
+        put_layer(s, art, lanes, frames, BELOW_BAR)
+    senses = s.senses[lanes] + (3 * s.shown_action[lanes] + s.shown_gain[lanes]) * WIDTHS + s.red[lanes]
+    frames.reshape(-1, SCREEN, ROW)[:, :BAR] = art.bars.take(senses, axis=0)[:, None]
+    if layered:
+        put_layer(s, art, lanes, frames, ABOVE_BAR)
+    return frames.reshape(-1, SCREEN, SCREEN, 3)
+
+
+def scene(s: State, art: Art, lanes: np.ndarray | slice) -> np.ndarray:
+    """The lanes in full light: (n, FRAME) uint8."""
+    frames = s.scenery.take(s.floor[lanes], axis=0)
+    put_agent(s, art, lanes, frames, True)
+    return frames
+
+
+def furnish(s: State, art: Art, lane: int) -> None:
+    """Draws the lane's scenery, whenever a coin or the exit has changed."""
+    frames, twice = floors().take(s.floors[lane], axis=0), np.array([lane, lane])
+    put_coins(s, art, twice, frames, True)
+    put_exit(s, art, twice, frames, True)
+    s.scenery[2 * lane : 2 * lane + 2] = frames
+
+
+def put_coins(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool) -> None:
+    """Draws the coins of the lanes that are shown, (n,) bool, into the frames, in place."""
+    looks = s.props[lanes]
+    for coin in range(COIN, s.bodies.shape[2]):
+        pos = s.bodies[:, lanes, coin].T  # (n, 2)
+        put(frames, art.props, looks, pos, shown & (pos[:, 0] != GONE))
+
+
+def put_exit(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool) -> None:
+    """Draws the exits of the lanes that are shown, (n,) bool, into the frames, in place."""
+    pos = s.bodies[:, lanes, EXIT].T  # (n, 2)
+    put(frames, art.props, (s.props + s.is_open)[lanes] + 1, pos, shown & (pos[:, 0] != GONE))
+
+
+def put_agent(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool) -> None:
+    """Draws the agents of the lanes that are shown, (n,) bool, into the frames, in place."""
+    put(frames, art.figures, (s.figure * FACINGS + s.look)[lanes], s.pos[lanes], shown)
+
+
+def put(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, shown: np.ndarray | bool) -> None:
+    """Pastes sprite rows[i] of the sheet at pos[i] into those of the frames that are shown, (n,) bool or just True."""
+    if shown is True or np.count_nonzero(shown) == len(rows):
+        paste(frames, sheet, rows, pos)
+    else:
+        at = np.flatnonzero(shown)
+        if at.size:
+            paste(frames, sheet, rows[at], pos[at], at)
+
+
+def put_layer(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, layer: int) -> None:
+    """Draws the exits and agents that belong to this layer, which the darkness does not cover."""
+    put_exit(s, art, lanes, frames, s.exit_layer[lanes] == layer)
+    put_agent(s, art, lanes, frames, s.agent_layer[lanes] == layer)
+
+
+def shine(s: State, tables: Lamps, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
+    """What the spotlights light and, if any has a rim, which pixels those are: bits, (n, 504) uint16."""
+    across, down = s.place[:, lanes]
+    start = (tables.column.take(across) + tables.row.take(down)).T.copy()  # (S, n)
+    lit = np.bitwise_or.reduce(_words(tables.disks[start]), axis=0).view(np.uint16)
+    if not np.count_nonzero(s.rim[lanes]):
+        return lit, None
+    # A later spotlight covers the rims of the earlier ones, and its own rim covers their light.
+    inner, rim = np.zeros((2, start.shape[1], ITEMS * SCREEN), np.uint16)
+    for spot in start:  # (n,)
+        disk_, own = (_words(table[spot]).view(np.uint16) for table in (tables.disks, tables.rims))
+        inner, rim = (inner | disk_) & ~own, (rim & ~disk_) | own
+    rimmed = s.rim[lanes][:, None]
+    return np.where(rimmed, inner, lit), rim * rimmed
+
+
+def _words(windows: np.ndarray) -> np.ndarray:
+    """Windows of a tape as (..., 126) uint64."""
+    return windows.view(np.uint64).reshape(*windows.shape, -1)
+
+
+def darken(s: State, lanes: np.ndarray | slice, frames: np.ndarray, lit: np.ndarray, rim: np.ndarray | None) -> None:
+    """Lays the darkness over the lanes' frames, (n, FRAME), in place.
+
+    lit: (n, FRAME) mask of what it leaves out. rim: (n, 504) bits of it that are white, or None.
+    """
+    dim = np.flatnonzero(s.length[lanes] < s.dark_at[lanes])  # where it is not just black
+    if dim.size:
+        who = dim if isinstance(lanes, slice) else lanes[dim]
+        opacity = s.darkness[who, np.minimum(s.length[who], FADE - 1)].astype(np.uint16)[:, None]
+        bright = frames[dim]
+        veiled = bright - (bright * opacity // 255).astype(np.uint8)
+        if rim is not None:
+            white = pixels(rim[dim]) > 0
+            veiled[white] = (bright + ((255 - bright) * opacity // 255).astype(np.uint8))[white]
+        veiled &= ~lit[dim]
+    frames &= lit
+    if dim.size:
+        frames[dim] |= veiled
+
+
+# ---- rules ----
+
+
+def retire(s: State) -> tuple[np.ndarray, np.ndarray]:
+    """Removes the spotlights that are through: lanes and slots, each (n,), of those that pause for this step.
+
+    The original removes them from the list that it is walking, so the one behind each is skipped: it neither moves nor
+    shines in that step.
+    """
+    lanes, slots = [], []
+    for lane in np.flatnonzero((s.spots[TIME] >= 1.0).any(axis=1)).tolist():
+        through = s.spots[TIME, lane] >= 1.0
+        kept, pausing, at = list(range(int(s.count[lane]))), [], 0
+        while at < len(kept):
+            if through[kept[at]]:
+                del kept[at]
+                pausing += kept[at : at + 1]
+            at += 1
+        left = len(kept)
+        s.spots[:, lane, :left], s.spot_key[lane, :left] = s.spots[:, lane, kept], s.spot_key[lane, kept]
+        s.spots[:, lane, left:], s.spot_key[lane, left:] = NO_SPOT[:, None], NO_KEY
+        s.count[lane] = left
+        slots += [kept.index(each) for each in pausing]
+        lanes += [lane] * len(pausing)
+    return np.array(lanes, np.intp), np.array(slots, np.intp)
+
+
+def burn(s: State, lanes: np.ndarray) -> np.ndarray:
+    """Damages the agents of these lanes; (n,) bool whose health is gone."""
+    s.health[lanes] -= s.damage[lanes]
+    s.floor[lanes] += 1
+    lost = 1 - s.health[lanes] / s.full[lanes]
+    s.red[lanes] = np.minimum(SCREEN // 2 * lost, SCREEN)  # cut off to whole pixels
+    return s.health[lanes] <= 0
+
+
+def take_coins(s: State, lane: int, touched: np.ndarray) -> int:
+    """Takes the lane's coins that are touched, (B,) bool, and returns how many those are."""
+    taken, skip = 0, False
+    for coin in np.flatnonzero(s.bodies[0, lane, COIN:] != GONE) + COIN:
+        if skip:  # the coin behind a taken one is skipped for this step, as in the original
+            skip = False
+        elif touched[coin]:
+            s.bodies[:, lane, coin] = GONE
+            taken, skip = taken + 1, True
+    s.left[lane] -= taken
+    s.is_open[lane] = s.left[lane] == 0
+    s.collected[lane] += taken
+    aim(s, lane)
+    return taken
+
+
+class SearingSpotlights(MemoryGymVectorEnv):
+    """Searing Spotlights (thesis 4.5; memory-gym 1.0.2), N lanes at once.
+
+    The light goes out in the first steps. Spotlights wander over the dark screen and show what is in them; each step in
+    one costs the agent health. It has to collect the coins and to leave through the exit, which opens then, all from
+    memory: of where things were, and of where it has been walking to since it was last seen. A bar at the top shows
+    health, the action before the last, and whether the step before the last was rewarded.
+
+    Variants:
+        SearingSpotlights-v0: one coin and the exit; a new spotlight every 40 steps.
+        Endless-SearingSpotlights-v0: one coin after the other, each visible for a moment and to be collected within 160
+            steps; a new spotlight every 50 steps, twice the health, no exit.
+
+    Actions: MultiDiscrete([3, 3]): horizontal (0 none, 1 left, 2 right) and vertical (0 none, 1 up, 2 down).
+    Observation: Box (84, 84, 3) uint8, rows first.
+    Rewards: `reward_coin` (0.25) for a coin, `reward_exit` (1) for leaving, and in every step `reward_inside_spotlight`
+        or `reward_outside_spotlight` (both 0); `reward_death` (0) is added when no health is left.
+    Episode end: terminated when no health is left, by leaving, without an exit by the last coin; in the endless id by
+        `steps_per_coin` steps without a coin. Truncated after `max_steps` steps, unless it ends at that very step. An
+        agent that knows everything needs 14 to 63 steps for the finite task, 33 on average (table 4.5).
+    Options: `VARIANTS[id].options`. Those marked * are lists, one entry of which is drawn at every reset. Radii and
+        speeds of spotlights are drawn between their smallest and largest.
+    Ground truth: (6,) x and y of the agent, of the first coin left and of the exit; the endless id (4,) without the
+        exit. In pixels over 84, so an agent that starts outside the screen has up to 86 / 84; 0 for what is not there.
+    Final info: `reward`, `length`, `agent_health` (share left, negative if the last hit took more than that),
+        `coins_collected` (a share, 1 if there were none; in the endless id a number), and `success` but in the endless
+        id.
+
+    Kept from the original: the bar shows the action and the reward of the step before the last. A spotlight behind one
+    that is removed skips that step, and so does a coin behind a taken one when several are touched at once. The wait
+    for the next spotlight is always the first of the planned intervals, as the last is what a spawn removes; so
+    spawn_interval_decay changes nothing, and neither does reward_max_steps. Radii of spotlights are whole pixels, from
+    spot_min_radius to spot_max_radius, both rounded down. The agent may start under the bar or outside the screen and
+    steps inside with its first step; before that it is drawn facing up, and no spotlight shines. Dying at the exit is
+    no success, though it pays. An endless task's coin may appear on the agent. Small coins (scale below 0.5) are all
+    rim and small exits all frame. What is visible in the dark is drawn above the bar or below it, depending on what
+    else is.
+    Differences from the original: images are rows first; max_steps truncates; the finite id reports ground truth;
+        nothing that an episode drew or painted black or white shows in the next; no exit, no coins and a hidden action
+        bar work; coins for which no free pixel is left are put anywhere; a smallest radius or speed above the largest
+        replaces it; `coin_enabled` is new; wrong options raise ValueError.
+    """
+
+    variants = VARIANTS
+
+    def spaces(self) -> tuple[gym.Space, gym.Space]:
+        """The observation and the action space of one lane."""
+        return gym.spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8), gym.spaces.MultiDiscrete([3, 3])
+
+    def allocate(self) -> None:
+        """Makes the state of N lanes."""
+        self.state = empty_state(self.num_envs)
+        self._settle()
+        self._through = False  # whether any spotlight has to be removed
+        self._unlocked: list[int] = []  # lanes without coins, whose exits open in the first step
+        self._place_tables()
+
+    def configure(self, lanes: np.ndarray) -> None:
+        """Takes over the options of the lanes, and the tables that all lanes' options need."""
+        s, endless, values = self.state, self.variant.endless, self.settings[int(lanes[0])]
+        make_room(s, coins=1 if endless else max(values["num_coins"], default=0))
+        for field, name in RULES.items():
+            getattr(s, field)[lanes] = values.get(name, 0)
+        s.limit[lanes] = _limit(values["max_steps"])
+        s.coin_limit[lanes] = _limit(values["steps_per_coin"] if endless and values["coin_enabled"] else -1)
+        s.coin_show[lanes] = NO_LIMIT if values["coins_visible"] else _limit(values.get("coin_show_duration", 0))
+        waits = ("spawn_interval",) if endless else ("initial_spawn_interval", "spawn_interval_threshold")
+        s.interval[lanes] = max(1, _limit(sum(values[name] for name in waits)))
+        radius = radius_of(values["agent_scale"])
+        coin, exit_ = int(10 * values["coin_scale"]), 10 * values.get("exit_scale", 0.0)
+        s.touch[lanes, COIN:], s.touch[lanes, EXIT] = (coin + radius) ** 2, (exit_ + radius) ** 2
+        s.touch[lanes, AGENT] = -1.0
+        self._configure_pictures(lanes, values)
+        self._settle()
+        self._place_tables()
+
+    def _configure_pictures(self, lanes: np.ndarray, values: dict[str, Any]) -> None:
+        s = self.state
+        plain = WHITE_FLOOR if values["hide_chessboard"] else BLUE_FLOOR
+        alarm = RED_FLOOR if plain == BLUE_FLOOR and values["visual_feedback"] else plain
+        s.rim[lanes] = values["black_background"]
+        s.floors[lanes] = BLACK_FLOOR if values["black_background"] else (plain, alarm)
+        s.darkness[lanes] = fading = _fading(values["light_dim_off_duration"], values["light_threshold"])
+        # A rim is drawn like dimmed pixels are, so with rims the darkness is never just black.
+        opaque = np.flatnonzero(fading == 255)
+        s.dark_at[lanes] = opaque[0] if opaque.size and not values["black_background"] else NO_LIMIT
+        shown = values["show_last_action"] + 2 * values["show_last_positive_reward"]
+        s.senses[lanes] = shown * SENSES
+        exit_, coins = values.get("exit_visible", False), values["coins_visible"]
+        # The original inserts the surfaces at places in a list that depend on each other.
+        s.exit_layer[lanes] = (BELOW_BAR if coins else ABOVE_BAR) if exit_ else UNDER
+        s.agent_layer[lanes] = (BELOW_BAR if coins and exit_ else ABOVE_BAR) if values["agent_visible"] else UNDER
+        s.layered[lanes] = exit_ or values["agent_visible"]
+
+    def _settle(self) -> None:
+        """Numbers the different figures and props of all lanes' options."""
+        figures, scales = zip(*((_figures(each), _scales(each)) for each in self.settings), strict=True)
+        self.figures, self.scales = tuple(dict.fromkeys(figures)), tuple(dict.fromkeys(scales))
+        # Each figure is there twice: the bar makes the ground less high than it is wide.
+        self.state.figure[:] = [2 * self.figures.index(figure) for figure in figures]
+        self.state.props[:] = [3 * self.scales.index(scale) for scale in scales]
+
+    def _place_tables(self) -> None:
+        """The tables that step() looks things up in, and where each lane's rows start in them."""
+        self._wardrobe = wardrobe(tuple(figure for pair in self.figures for figure in pair))
+        radii = [values[name] for values in self.settings for name in ("spot_min_radius", "spot_max_radius")]
+        spots = lamps(int(min(radii)), int(max(radii)))
+        self._art = Art(spots, self._wardrobe.sheet, props(self.scales), bars(self.variant.endless))
+        self._controls = free_controls()
+        self._calm = np.arange(0, 2 * self.num_envs, 2)  # (N,) the scenery's calm rows
+        self._lane_walk = (self.state.figure[:, None] + np.arange(2)) * (STRIDES * SPAN)  # (N, 2)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The tables are large and follow from the options.
+        return {name: value for name, value in self.__dict__.items() if name not in ("_wardrobe", "_art")}
+
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        self.__dict__.update(values)
+        self._place_tables()
+
+    def begin(self, lane: int, rng: np.random.Generator) -> None:
+        """Draws the lane's next level and starts its episode."""
+        values = self.settings[lane]
+        spawns = NO_LIMIT if self.variant.endless else _limit(values["num_spawns"])
+        level = draw_level(rng, values, self.variant)
+        write_level(self.state, lane, level, spawns)
+        furnish(self.state, self._art, lane)
+        if not level.coins:
+            self._unlocked.append(lane)
+
+    def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """One step of the rules: walk, spawn, shine, burn, collect, leave."""
+        s = self.state
+        s.length += 1
+        self._move(actions)
+        while self._unlocked:
+            lane = self._unlocked.pop()
+            s.is_open[lane] = s.left[lane] == 0
+            furnish(s, self._art, lane)
+        s.wait -= 1
+        due = s.wait == 0
+        if np.count_nonzero(due):
+            for lane in np.flatnonzero(due).tolist():
+                self._spawn(lane)
+        hit = self._shine()
+        rewards, terminated, s.floor = s.reward_outside.copy(), np.zeros(self.num_envs, bool), self._calm.copy()
+        if np.count_nonzero(hit):
+            lanes = np.flatnonzero(hit)
+            terminated[lanes] = dead = burn(s, lanes)
+            rewards[lanes] = s.reward_inside[lanes] + s.reward_death[lanes] * dead
+        gap = s.bodies - s.bodies[:, :, :1]  # (2, N, B)
+        gap *= gap
+        touched = gap[0] + gap[1] <= s.touch
+        if np.count_nonzero(touched):
+            self._collect(touched, rewards)
+            if not self.variant.endless:
+                self._leave(touched, rewards, terminated)
+        return rewards, terminated, self._finish(rewards, terminated)
+
+    def _move(self, actions: np.ndarray) -> None:
+        s = self.state
+        action = actions[:, 0] * 3 + actions[:, 1]  # (N,)
+        s.shown_action, s.last_action = s.last_action, action
+        s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._wardrobe.walk)
+        s.look = s.facing.copy()
+        np.subtract(s.pos.T, PAD, out=s.bodies[:, :, AGENT])
+
+    def _spawn(self, lane: int) -> None:
+        """Adds a spotlight to the lane's."""
+        s = self.state
+        add_spot(s, lane, draw_spot(self._rngs[lane], self.settings[lane]))
+        s.spawns[lane] -= 1
+        # Always the first interval of the original's list, as its spawns remove the last one.
+        s.wait[lane] = s.interval[lane] if s.spawns[lane] else NO_LIMIT
+
+    def _shine(self) -> np.ndarray:
+        """Moves the spotlights on; (N,) bool whose agent is in the light."""
+        s = self.state
+        pausing = retire(s) if self._through else None
+        time = s.spots[TIME]  # (N, S)
+        spot = time * s.spots[BEND]  # (2, N, S)
+        spot += s.spots[TOWARD]
+        spot *= time
+        spot += s.spots[START]
+        place = spot.astype(np.int64)
+        place += s.spot_key
+        gap = spot - s.bodies[:, :, :1]
+        gap *= gap
+        inside = gap[0] + gap[1] <= s.spots[REACH]
+        if pausing is None:
+            time += s.spots[SPEED]
+        else:
+            held = time[pausing]
+            time += s.spots[SPEED]
+            time[pausing] = held
+            inside[pausing] = False
+            spot[(ALL, *pausing)], place[(ALL, *pausing)] = AWAY, 0
+        self._through = np.count_nonzero(time >= 1.0) > 0
+        s.spot, s.place = spot, place
+        return inside.any(axis=1)
+
+    def _collect(self, touched: np.ndarray, rewards: np.ndarray) -> None:
+        """Takes the coins that are touched, (N, B) bool; the endless id then has a new one."""
+        s = self.state
+        for lane in np.flatnonzero(touched[:, COIN:].any(axis=1)).tolist():
+            last = tuple(s.bodies[:, lane, COIN].tolist())
+            rewards[lane] += s.reward_coin[lane] * take_coins(s, lane, touched[lane])
+            if self.variant.endless:
+                s.bodies[:, lane, COIN] = draw_coin(self._rngs[lane], last)
+                s.left[lane], s.coin_age[lane] = 1, 0
+                aim(s, lane)
+            furnish(s, self._art, lane)
+
+    def _leave(self, touched: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
+        """Ends the episodes whose agent stands at the open exit or, without one, has just taken the last coin."""
+        s = self.state
+        has_exit = s.bodies[0, :, EXIT] != GONE
+        done = (s.left == 0) & np.where(has_exit, touched[:, EXIT], s.coins > 0)
+        rewards += s.reward_exit * (done & has_exit)
+        s.success[:] = done & ~terminated
+        terminated |= done
+
+    def _finish(self, rewards: np.ndarray, terminated: np.ndarray) -> np.ndarray:
+        """Counts the step; (N,) bool which episodes are truncated."""
+        s = self.state
+        if self.variant.endless:
+            s.coin_age += 1
+            terminated |= s.coin_age == s.coin_limit
+        s.shown_gain, s.last_gain = s.last_gain, (rewards > 0) + 1
+        s.returned += rewards
+        return (s.length == s.limit) & ~terminated
+
+    def observe(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh observations of the lanes: their frames."""
+        return self.frames(lanes)
+
+    def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh frames of the lanes, (n, 84, 84, 3)."""
+        return draw(self.state, self._art, lanes)
+
+    def ground_truth(self) -> np.ndarray:
+        """A fresh (N, 6), or (N, 4) in the endless id: the agent's, the coin's and the exit's x and y, over 84."""
+        s = self.state
+        truth = np.empty((self.num_envs, 4 if self.variant.endless else 6))
+        truth[:, :2] = s.bodies[:, :, AGENT].T
+        truth[:, 2:] = s.goal[:, : truth.shape[1] - 2]
+        truth /= SCREEN
+        return truth
+
+    def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
+        """The lanes' ended episodes in numbers."""
+        s = self.state
+        numbers = {"reward": s.returned[lanes], "length": s.length[lanes], "agent_health": (s.health / s.full)[lanes]}
+        if self.variant.endless:
+            return numbers | {"coins_collected": s.collected[lanes]}
+        coins = s.coins[lanes]
+        share = np.where(coins > 0, s.collected[lanes] / np.maximum(coins, 1), 1.0)
+        return numbers | {"coins_collected": share, "success": s.success[lanes]}
+
+    def annotate(self, frame: np.ndarray, lane: int) -> None:
+        """Lights everything below the bar, and circles the spotlights."""
+        s, lanes = self.state, np.array([lane])
+        lit = scene(s, self._art, lanes)
+        below = slice(BAR * DEBUG_ZOOM, None)
+        frame[below] = magnify(lit.reshape(SCREEN, SCREEN, 3), DEBUG_ZOOM)[below]
+        for slot in np.flatnonzero(s.place[0, lane]).tolist():
+            radius = int(s.spots[RADIUS, lane, slot])
+            x, y = (s.place[:, lane, slot] - radius * PLACES - PLACE_0).tolist()
+            circle = ring(len(frame), x * DEBUG_ZOOM, y * DEBUG_ZOOM, radius * DEBUG_ZOOM, DEBUG_ZOOM)
+            circle[: BAR * DEBUG_ZOOM] = False
+            frame[circle] = GREEN
+
+
+# What the rules take over from the options as it is.
+RULES = {
+    "full": "agent_health",
+    "damage": "spot_damage",
+    "reward_inside": "reward_inside_spotlight",
+    "reward_outside": "reward_outside_spotlight",
+    "reward_death": "reward_death",
+    "reward_coin": "reward_coin",
+    "reward_exit": "reward_exit",
+}
+
+
+def _limit(steps: int) -> int:
+    return NO_LIMIT if steps == -1 else min(steps, NO_LIMIT)
+
+
+def _fading(duration: int, threshold: int) -> np.ndarray:
+    """(FADE,) uint8: the darkness' opacity after so many steps."""
+    if not duration:
+        return np.full(FADE, threshold, np.uint8)
+    opacity = [0]
+    while len(opacity) < FADE:  # the last addition may pass the threshold, as in the original
+        opacity.append(min(255, opacity[-1] + 255 // duration) if opacity[-1] <= threshold else opacity[-1])
+    return np.array(opacity, np.uint8)
+
+
+def _figures(values: dict[str, Any]) -> tuple[Figure, Figure]:
+    """The agent's figure as it walks across and as it walks down, where the bar is in its way."""
+    scale, speed = values["agent_scale"], values["agent_speed"]
+    across, down = (Figure(scale, speed, low, SCREEN, radius_of(scale), False) for low in (0, BAR))
+    return across, down
+
+
+def _scales(values: dict[str, Any]) -> tuple[float, float]:
+    return values["coin_scale"], values.get("exit_scale", values["coin_scale"])

@@ -1,0 +1,321 @@
+"""Searing Spotlights: the scripted player's return, how episodes end, and the original's quirks one by one."""
+
+import copy
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from players import player
+
+from memory_gym_envs.searing_spotlights import AGENT, COIN, EXIT, GONE, REACH, TIME
+
+FINITE, ENDLESS = "SearingSpotlights-v0", "Endless-SearingSpotlights-v0"
+SAFE = {"spot_damage": 0}
+
+
+def play_out(env, act, seed, options=None):
+    """One episode of a single environment: rewards, the last step's flags and its info."""
+    env.reset(seed=seed, options=options)
+    rewards, terminated, truncated = [], False, False
+    while not (terminated or truncated):
+        _, reward, terminated, truncated, info = env.step(act())
+        rewards.append(reward)
+    return rewards, terminated, truncated, info
+
+
+def make(env_id, **arguments):
+    env = gym.make(env_id, **arguments).unwrapped
+    return env, lambda: player(env.batch)[0]
+
+
+def still():
+    return [0, 0]
+
+
+# ---- the task ----
+
+
+@pytest.mark.parametrize("coins", [0, 1, 2, 5])
+@pytest.mark.parametrize("seed", range(4))
+def test_player_collects_every_coin_and_leaves(coins, seed):
+    env, act = make(FINITE)
+    rewards, terminated, truncated, info = play_out(env, act, seed, {**SAFE, "num_coins": [coins]})
+    assert (terminated, truncated) == (True, False)
+    assert [r for r in rewards if r] == [0.25] * coins + [1.0]
+    assert info["reward"] == 0.25 * coins + 1.0
+    assert info["length"] == len(rewards)
+    assert (info["success"], info["coins_collected"], info["agent_health"]) == (1, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("coins", [1, 3])
+def test_without_an_exit_the_last_coin_ends_the_episode(coins):
+    env, act = make(FINITE)
+    rewards, terminated, _, info = play_out(env, act, 1, {**SAFE, "num_coins": [coins], "use_exit": False})
+    assert terminated
+    assert [r for r in rewards if r] == [0.25] * coins
+    assert rewards[-1] == 0.25
+    assert info["success"] == 1
+    assert not info["ground_truth"][2:].any()
+
+
+@pytest.mark.parametrize("coins", [[], [0]])
+def test_with_nothing_to_do_time_runs_out(coins):
+    env, act = make(FINITE)
+    options = {**SAFE, "num_coins": coins, "use_exit": False, "max_steps": 40, "reward_max_steps": -1}
+    rewards, terminated, truncated, info = play_out(env, act, 1, options)
+    assert (len(rewards), terminated, truncated) == (40, False, True)
+    assert not any(rewards)  # reward_max_steps is ignored, as in the original
+    assert (info["success"], info["coins_collected"]) == (0, 1.0)
+
+
+def test_default_player_mostly_wins():
+    """Walking straight, without a look at the spotlights, succeeds in most levels and never earns anything else."""
+    envs = gym.make_vec(FINITE, num_envs=8)
+    envs.reset(seed=0)
+    earned = []
+    for _ in range(300):
+        *_, infos = envs.step(player(envs))
+        for lane in np.flatnonzero(infos.get("_final_info", ())):
+            final = {key: values[lane] for key, values in infos["final_info"].items()}
+            earned.append(final["reward"])
+            assert final["reward"] in (0.0, 0.25, 1.25)
+            assert final["success"] == (final["reward"] == 1.25 and final["agent_health"] > 0)
+    assert np.mean(np.array(earned) == 1.25) > 0.7
+
+
+def test_endless_player_collects_until_time_runs_out():
+    env, act = make(ENDLESS)
+    env.reset(seed=5, options={**SAFE, "max_steps": 2000})
+    total, places, truncated = 0.0, set(), False
+    while not truncated:
+        places.add(tuple(env.batch.state.bodies[:, 0, COIN].tolist()))
+        _, reward, terminated, truncated, info = env.step(act())
+        assert not terminated
+        assert reward in (0.0, 0.25)
+        total += reward
+    assert info["length"] == 2000
+    assert info["coins_collected"] == total / 0.25 >= len(places) - 1 > 40
+    assert info["reward"] == total
+
+
+def test_endless_coin_has_a_deadline():
+    env, _ = make(ENDLESS)
+    options = {**SAFE, "steps_per_coin": 30}
+    # Away from the coin: an agent in a corner.
+    _, terminated, truncated, info = play_out(env, lambda: [1, 1], 3, options)
+    assert (terminated, truncated) == (True, False)
+    assert info["length"] % 30 == 0 or info["coins_collected"]
+    assert info["agent_health"] == 1.0
+
+
+def test_endless_without_coins():
+    env, act = make(ENDLESS)
+    options = {**SAFE, "coin_enabled": False, "max_steps": 300}
+    rewards, terminated, truncated, info = play_out(env, act, 3, options)
+    assert (len(rewards), terminated, truncated) == (300, False, True)
+    assert not any(rewards)
+    assert not info["ground_truth"][2:].any()
+
+
+@pytest.mark.parametrize("env_id", [FINITE, ENDLESS])
+def test_time_limit_truncates_and_death_at_that_step_terminates(env_id):
+    env, _ = make(env_id)
+    options = {"initial_spawns": 30} | ({"steps_per_coin": -1} if env_id == ENDLESS else {})
+    died = len(play_out(env, still, 0, options)[0])
+    for limit in (died - 1, died, died + 1):
+        rewards, terminated, truncated, _ = play_out(env, still, 0, {**options, "max_steps": limit})
+        assert len(rewards) == min(limit, died)
+        assert (terminated, truncated) == ((False, True) if limit < died else (True, False))
+
+
+# ---- health and rewards ----
+
+
+@pytest.mark.parametrize("env_id", [FINITE, ENDLESS])
+def test_light_costs_health_and_pays_the_step(env_id):
+    env, _ = make(env_id)
+    options = {"initial_spawns": 20, "reward_inside_spotlight": -0.5, "reward_outside_spotlight": 0.125}
+    options |= {"reward_death": -4.0, "agent_health": 3, "spot_damage": 2.0}
+    if env_id == ENDLESS:
+        options["steps_per_coin"] = -1
+    rewards, terminated, _, info = play_out(env, still, 2, options)
+    inside = [r for r in rewards if r < 0]
+    assert terminated
+    assert inside == [-0.5, -4.5]
+    assert rewards[-1] == -4.5
+    assert set(rewards[:-1]) <= {-0.5, 0.125}
+    assert info["agent_health"] == pytest.approx(-1 / 3)
+    assert info["reward"] == pytest.approx(sum(rewards))
+
+
+def test_dying_at_the_exit_pays_but_is_no_success():
+    env, act = make(FINITE)
+    env.reset(seed=0, options={"initial_spawns": 1, "num_spawns": 0, "reward_death": -0.5})
+    env.batch.state.spots[REACH, 0, 0] = -1.0  # a spotlight that does no harm
+    reward = 0.0
+    while reward < 1.0:
+        earlier = copy.deepcopy(env)
+        _, reward, _, _, info = env.step(act())
+    assert info["success"] == 1
+    # The same step again, but with the last health lost in it.
+    s = earlier.batch.state
+    s.spots[REACH, 0, 0], s.health[0] = 1e6, 1.0
+    _, reward, terminated, _, info = earlier.step(player(earlier.batch)[0])
+    assert terminated
+    assert (reward, info["success"], info["coins_collected"], info["agent_health"]) == (0.5, 0, 1.0, 0.0)
+
+
+def test_bar_shows_the_action_and_the_reward_before_the_last():
+    colors = [(120, 120, 120), (116, 1, 113), (255, 94, 14)]
+    env, act = make(FINITE)
+    env.reset(seed=0, options={**SAFE, "num_coins": [3]})
+    history, gains = [[0, 0]], [False]
+    for _ in range(60):
+        action = act().tolist()
+        observation, reward, over, _, _ = env.step(action)
+        before_last, gained = history[-1], gains[-1]
+        assert tuple(observation[1, 50]) == colors[before_last[0]]
+        assert tuple(observation[1, 80]) == colors[before_last[1]]
+        assert tuple(observation[1, 60]) == ((255, 255, 0) if gained else (50, 50, 50))
+        history.append(action)
+        gains.append(reward > 0)
+        if over:
+            break
+    assert over
+    assert sum(gains) == 4
+
+
+@pytest.mark.parametrize("env_id", [FINITE, ENDLESS])
+@pytest.mark.parametrize("action_shown", [False, True])
+@pytest.mark.parametrize("reward_shown", [False, True])
+def test_bar_hides_what_it_is_told_to(env_id, action_shown, reward_shown):
+    env, act = make(env_id)
+    options = {"show_last_action": action_shown, "show_last_positive_reward": reward_shown, **SAFE}
+    env.reset(seed=0, options=options)
+    colors = set()
+    for _ in range(15):
+        observation, *_ = env.step(act())
+        colors |= {tuple(pixel) for pixel in observation[1, 42:].tolist()}
+    ground = (0, 0, 0) if env_id == ENDLESS else (50, 50, 50)
+    assert ((120, 120, 120) in colors) == action_shown
+    if not action_shown:
+        assert colors <= {ground, (50, 50, 50), (255, 255, 0)}
+
+
+# ---- spotlights ----
+
+
+def test_wait_is_always_the_first_interval():
+    """30 + 10 steps, whatever the decay, 30 times; the endless task every 50 steps for ever."""
+    for env_id, interval, first in ((FINITE, 40, 4), (ENDLESS, 50, 3)):
+        env, _ = make(env_id)
+        options = {**SAFE, "spot_min_speed": 0.0, "spot_max_speed": 0.0, "max_steps": 1000}
+        options |= {"spawn_interval_decay": 0.5} if env_id == FINITE else {"steps_per_coin": -1}
+        env.reset(seed=0, options=options)
+        counts = [(env.step([0, 0]), int(env.batch.state.count[0]))[1] for _ in range(400)]
+        assert counts == [first + (step + 1) // interval for step in range(400)]
+
+
+def test_num_spawns_runs_out():
+    env, _ = make(FINITE)
+    slow = {"spot_min_speed": 0.0, "spot_max_speed": 0.0}
+    options = {**SAFE, **slow, "num_spawns": 3, "initial_spawns": 0, "initial_spawn_interval": 0}
+    env.reset(seed=0, options={**options, "spawn_interval_threshold": 0})
+    counts = [(env.step([0, 0]), int(env.batch.state.count[0]))[1] for _ in range(10)]
+    assert counts == [1, 2, 3] + [3] * 7
+
+
+def test_spotlight_behind_a_removed_one_pauses():
+    env, _ = make(FINITE)
+    env.reset(seed=0, options={**SAFE, "initial_spawns": 4, "num_spawns": 0})
+    env.step([0, 0])
+    s = env.batch.state
+    s.spots[TIME, 0, :4] = [1.0, 0.25, 1.0, 0.5]
+    env.batch._through = True
+    env.step([0, 0])
+    # The second skips a step behind the first, and the fourth behind the third.
+    assert s.count[0] == 2
+    assert s.spots[TIME, 0, :2].tolist() == [0.25, 0.5]
+    assert not env.batch.state.place[:, 0].any()
+    env.step([0, 0])
+    assert (s.spots[TIME, 0, :2] > [0.25, 0.5]).all()
+    assert env.batch.state.place[:, 0, :2].all()
+
+
+@pytest.mark.parametrize("low_high", [("spot_min_radius", "spot_max_radius"), ("spot_min_speed", "spot_max_speed")])
+def test_smallest_above_largest_replaces_it(low_high):
+    low, high = low_high
+    value = 20.0 if "radius" in low else 0.02
+    env, _ = make(FINITE)
+    env.reset(seed=0, options={low: value, high: value / 2, "initial_spawns": 10})
+    drawn = env.batch.state.spots[2 if "radius" in low else 1, 0, :10]
+    assert (drawn == value).all()
+
+
+def test_dimming():
+    """Light until the first step, black after the seventh, by the original's 42 of 255 a step."""
+    env, _ = make(FINITE)
+    observation, _ = env.reset(seed=0, options={"initial_spawns": 0, "num_spawns": 0})
+    white = []
+    for _ in range(10):
+        white.append(int(observation[4:].max()))
+        observation, *_ = env.step([0, 0])
+    assert white == [255, 213, 171, 129, 87, 45, 3, 0, 0, 0]
+    env.reset(seed=0, options={"light_threshold": 100, "initial_spawns": 0})
+    for _ in range(10):
+        observation, *_ = env.step([0, 0])
+    assert observation[4:].max() == 255 - 126  # the first step beyond the threshold
+
+
+# ---- levels ----
+
+
+def test_things_keep_their_distance():
+    env, _ = make(FINITE)
+    for seed in range(200):
+        env.reset(seed=seed, options={"num_coins": [3]})
+        bodies = env.batch.state.bodies[:, 0]
+        assert (bodies[:, EXIT:] >= 7).all()
+        assert (bodies[:, EXIT:] <= 77).all()
+        assert (bodies[:, AGENT] >= 2).all()
+        assert (bodies[:, AGENT] <= 86).all()
+        for coin in range(COIN, COIN + 3):
+            # 28 pixels before both are moved by up to 1 pixel apart and into the margin, up to 7 on both axes.
+            assert math.dist(bodies[:, AGENT], bodies[:, coin]) > 28 - 1.5 - 10
+
+
+@pytest.mark.parametrize("coins", [4, 20])
+def test_more_coins_than_there_is_room_for(coins):
+    env, act = make(FINITE)
+    for seed in range(20):
+        rewards, _, _, info = play_out(env, act, seed, {**SAFE, "num_coins": [coins], "max_steps": 2000})
+        assert info["coins_collected"] == 1.0
+        assert sum(rewards) == 0.25 * coins + 1
+
+
+def test_optimal_length_of_levels():
+    """Table 4.5: distance from the agent to the coin to the exit over speed has mean 33.36, minimum 14, maximum 63."""
+    envs = gym.make_vec(FINITE, num_envs=100)
+    lengths = []
+    for start in range(0, 5000, 100):
+        places = envs.reset(seed=start)[1]["ground_truth"].reshape(100, 3, 2) * 84
+        way = np.linalg.norm(np.diff(places, axis=1), axis=2).sum(axis=1)
+        lengths += np.ceil(way / 3).tolist()
+    assert abs(np.mean(lengths) - 33.36) < 0.5
+    assert abs(np.std(lengths) - 7.56) < 0.5
+    assert min(lengths) >= 14
+    assert max(lengths) <= 63
+
+
+def test_ground_truth_is_where_things_are():
+    env, act = make(FINITE)
+    _, info = env.reset(seed=0, options={**SAFE, "num_coins": [2]})
+    over = False
+    while not over:
+        bodies = env.batch.state.bodies[:, 0]
+        coins = bodies[:, COIN:][:, bodies[0, COIN:] != GONE]
+        first = coins[:, 0] if coins.size else np.zeros(2)
+        expected = np.concatenate([bodies[:, AGENT], first, bodies[:, EXIT]]) / 84
+        np.testing.assert_allclose(info["ground_truth"], expected)
+        _, _, over, _, info = env.step(act())
