@@ -41,6 +41,7 @@ MAP_STRIDES = np.array([ROWS, 1])
 PIT = 0  # the step of the path at places that are none; the path's own steps count from 1, the origin
 NOWHERE = -1  # the cell of that step
 NO_STEP = -1  # where an agent is while it is put back
+TILE_AT = (np.arange(SPAN) - PAD) // TILE  # of stored positions on the screen
 BRANCHES = np.array([3, 1])  # numbers the actions of two branches
 
 EAST, NORTH, SOUTH, WEST = range(4)
@@ -523,7 +524,7 @@ def draw_trail(frames: np.ndarray, s: State, lanes: np.ndarray | slice) -> None:
 
 def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: np.ndarray | slice, endless: bool) -> None:
     """Draws the agents, their stamina and their crosses on the frames (n, FRAME), in place."""
-    pos, extras = s.pos[lanes], np.count_nonzero(s.extras[lanes])
+    pos, extras = s.pos[lanes], endless and np.count_nonzero(s.extras[lanes])
     if endless:
         pos = pos.copy()
         pos[:, 0] = s.figure_x[lanes]
@@ -739,9 +740,11 @@ class MysteryPath(MemoryGymVectorEnv):
         s, endless = self.state, self.variant.endless
         s.length += 1
         self._move(actions)
-        s.tile = (s.pos - PAD) // TILE  # (N, 2)
         if endless:
+            s.tile = (s.pos - PAD) // TILE  # (N, 2)
             self._lengthen()
+        else:
+            s.tile = TILE_AT.take(s.pos)  # (N, 2)
         cell = s.tile.dot(MAP_STRIDES) + self._lane_map  # (N,)
         before, s.step = s.step, s.step_at.take(cell)
         s.fallen = s.step == PIT
