@@ -149,14 +149,15 @@ class MemoryGymVectorEnv(VectorEnv):
         if not self.ready:
             raise gym.error.ResetNeeded("call reset() before step()")
         rewards, terminated, truncated = self.advance(self.checked_actions(actions))
-        infos: dict[str, Any] = {}
-        ended = np.flatnonzero(terminated | truncated)
+        observations, infos = self.observe(ALL), {}
+        (ended,) = (terminated | truncated).nonzero()
         if ended.size:
-            infos = self._final_info(ended)
+            infos = self._final_info(ended, observations)
             for lane in ended.tolist():
                 self._next_level(lane, None)
+            _overwrite(observations, ended, self.observe(ended))
         infos.update(self._truth_info(None))
-        return self.observe(ALL), rewards, terminated, truncated, infos
+        return observations, rewards, terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """One picture per lane: (84, 84, 3), or (336, 336, 3) in the debug mode. None without a render mode."""
@@ -261,13 +262,13 @@ class MemoryGymVectorEnv(VectorEnv):
             truth[~mask] = 0.0
         return {"ground_truth": truth, "_ground_truth": mask}
 
-    def _final_info(self, ended: np.ndarray) -> dict[str, Any]:
+    def _final_info(self, ended: np.ndarray, observations: Any) -> dict[str, Any]:
         """final_obs and final_info of the lanes whose episode ended, as SyncVectorEnv lays them out."""
         mask = np.zeros(self.num_envs, bool)
         mask[ended] = True
         final_obs = np.full(self.num_envs, None, object)
-        for lane, observation in zip(ended.tolist(), _unbatched(self.observe(ended)), strict=True):
-            final_obs[lane] = observation
+        for lane in ended.tolist():
+            final_obs[lane] = _one(observations, lane)
         truth = self.ground_truth()
         truth[~mask] = 0.0
         final_info: dict[str, np.ndarray] = {}
@@ -305,9 +306,17 @@ def _brief(value: Any) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def _unbatched(observations: Any) -> list[Any]:
-    """The lanes' observations one by one."""
+def _one(observations: Any, lane: int) -> Any:
+    """A copy of the lane's observation."""
     if isinstance(observations, dict):
-        columns = zip(*observations.values(), strict=True)
-        return [dict(zip(observations, column, strict=True)) for column in columns]
-    return list(observations)
+        return {key: values[lane].copy() for key, values in observations.items()}
+    return observations[lane].copy()
+
+
+def _overwrite(observations: Any, lanes: np.ndarray, fresh: Any) -> None:
+    """Replaces the lanes' observations, in place."""
+    if isinstance(observations, dict):
+        for key, values in observations.items():
+            values[lanes] = fresh[key]
+    else:
+        observations[lanes] = fresh

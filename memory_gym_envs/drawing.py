@@ -65,7 +65,7 @@ class Sheet(NamedTuple):
     canvases: tuple[np.ndarray, np.ndarray]  # what those are windows of
     frame_start: np.ndarray  # (P * P,) first pixel of the frame's window, for every y and x
     canvas_start: np.ndarray  # (P * P,) first pixel of the canvas' window, for every y and x
-    positions: int  # P
+    strides: np.ndarray  # (2,) from x and y to the index of these two
 
 
 def make_sheet(sprites: np.ndarray, solid: np.ndarray, positions: np.ndarray) -> Sheet:
@@ -94,7 +94,7 @@ def make_sheet(sprites: np.ndarray, solid: np.ndarray, positions: np.ndarray) ->
         (keep, ink),
         (frame_start[:, None] * SCREEN + frame_start).reshape(-1),
         (source[:, None] * canvas + source).reshape(-1),
-        len(positions),
+        np.array([1, len(positions)]),
     )
 
 
@@ -110,7 +110,7 @@ def paste(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, o
             _paste_one(frames, sheet, rows[i], pos[i], i if owner is None else owner[i])
         return
     first = np.arange(0, len(frames) * SCREEN * SCREEN, SCREEN * SCREEN) if owner is None else owner * SCREEN * SCREEN
-    place = pos[:, 1] * sheet.positions + pos[:, 0]  # (n,)
+    place = pos.dot(sheet.strides)  # (n,)
     start = sheet.frame_start.take(place) + first
     source = sheet.canvas_start.take(place) + rows * (sheet.canvas * sheet.canvas)
     squares = windows(frames, SCREEN, sheet.row)  # a square never leaves its frame, as frame_start is clipped

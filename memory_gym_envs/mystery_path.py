@@ -6,7 +6,6 @@ Shape letters: N lanes, n some of them, M cells of the map, P steps of the path 
 import math
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -42,10 +41,12 @@ MAP_STRIDES = np.array([ROWS, 1])
 PIT = 0  # the step of the path at places that are none; the path's own steps count from 1, the origin
 NOWHERE = -1  # the cell of that step
 NO_STEP = -1  # where an agent is while it is put back
+TILE_AT = (np.arange(SPAN) - PAD) // TILE  # of stored positions on the screen
 BRANCHES = np.array([3, 1])  # numbers the actions of two branches
 
 EAST, NORTH, SOUTH, WEST = range(4)
-HEADINGS = {ROWS: EAST, -1: NORTH, 1: SOUTH, -ROWS: WEST}  # by the difference of two cells
+HEADINGS = np.zeros(2 * ROWS + 1, np.int64)  # by ROWS + the difference of two cells
+HEADINGS[[ROWS + ROWS, ROWS - 1, ROWS + 1, ROWS - ROWS]] = EAST, NORTH, SOUTH, WEST
 
 
 # ---- configuration ----
@@ -122,6 +123,11 @@ class State:
     fresh: np.ndarray  # (N, P) bool: the step has a reward for reaching it
     restful: np.ndarray  # (N, P) bool: the step gives stamina back
     step_at: np.ndarray  # (N, M) the inverse of cell: the step of the path that is there, or PIT
+    past: np.ndarray  # (N,) bool: something of the path behind the agent is shown
+    trail_lane: np.ndarray  # (m,) the lane of each tile of the path that is shown behind any agent
+    trail_x: np.ndarray  # (m,) its first pixel, counted along the path
+    trail_y: np.ndarray  # (m,)
+    hurt: np.ndarray  # (N,) bool: in the pit, and a cross shows it
     known: np.ndarray  # (N, M) bool: the agent fell off there before
     walls: np.ndarray  # (N, S) each segment's untraceable places, a bit set
     segments: np.ndarray  # (N,)
@@ -138,7 +144,7 @@ class State:
     show_past: np.ndarray  # (N,) bool
     show_ground: np.ndarray  # (N,) bool
     show_stamina: np.ndarray  # (N,) bool
-    extras: np.ndarray  # (N,) bool: one of these, but for the past path
+    extras: np.ndarray  # (N,) bool: one of these, but for the past path, or a speed above PAD
     feedback: np.ndarray  # (N,) bool
     camera: np.ndarray  # (N,) float64: pixels between the screen's left edge and the path's, when the agent is there
     depth: np.ndarray  # (N,) columns of the past path that are shown, and the agent's own
@@ -159,13 +165,14 @@ def empty_state(lanes: int, segments: int) -> State:
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("pos", "origin", "tile"), (2,))
     shapes |= {"walls": (segments,), "speed": (1,), "step_at": cells, "known": cells}
     shapes |= dict.fromkeys(("cell", "heading_at", "fresh", "restful"), steps)
-    flags = ("fallen", "fresh", "restful", "known", "extras", "feedback")
+    flags = ("fallen", "past", "hurt", "fresh", "restful", "known", "extras", "feedback")
     kinds: dict[str, Any] = dict.fromkeys((*flags, *(f"show_{what}" for what in SHOWN)), bool)
     kinds |= dict.fromkeys(("returned", "camera"), np.float64) | {"heading_at": np.uint8}
     kinds |= dict.fromkeys(("reward_goal", "reward_fall_off", "reward_progress", "reward_step"), np.float64)
     names = State.__dataclass_fields__
     s = State(**{name: np.zeros((lanes, *shapes.get(name, ())), kinds.get(name, np.int64)) for name in names})
     s.cell[:, PIT] = NOWHERE
+    s.trail_lane = s.trail_x = s.trail_y = np.zeros(0, np.int64)
     return s
 
 
@@ -222,6 +229,12 @@ BORDER = [1 << place for place, spot in enumerate(PLACES) if 0 in spot or SIDE -
 DISTANCES = [[math.sqrt((a - x) ** 2 + (b - y) ** 2) for a, b in PLACES] for x, y in PLACES]
 
 
+WALLS = 33  # the chance of a wall in percent
+# In 32-bit words: below which one that is, and the few for which a number below 100 is drawn again.
+WALL_WORDS = -((-WALLS << 32) // 100)
+AGAIN = {word for part in range(100) if (word := -((-part << 32) // 100)) * 100 % (1 << 32) < (1 << 32) % 100}
+
+
 class Tape:
     """What a generator is about to draw, read ahead: a path takes a hundred numbers, and asking for each is slow.
 
@@ -244,13 +257,13 @@ class Tape:
             if (product & 0xFFFFFFFF) >= limit or (product & 0xFFFFFFFF) >= (1 << 32) % limit:
                 return product >> 32
 
-    def dice(self, count: int) -> list[int]:
-        """So many numbers below 100."""
-        products = [word * 100 for word in self.words[self.used : self.used + count]]
-        if min([product & 0xFFFFFFFF for product in products]) < (1 << 32) % 100:
-            return [self.below(100) for _ in range(count)]
+    def chances(self, count: int) -> list[bool]:
+        """Of so many numbers below 100, which are below WALLS."""
+        words = self.words[self.used : self.used + count]
+        if not AGAIN.isdisjoint(words):
+            return [self.below(100) < WALLS for _ in range(count)]
         self.used += count
-        return [product >> 32 for product in products]
+        return [word < WALL_WORDS for word in words]
 
     def close(self) -> None:
         """Leaves the generator as if it had drawn the used words only."""
@@ -305,8 +318,8 @@ def draw_walls(tape: Tape, start: int, end: int) -> int:
     So there always is a path: along the border, and one ring further inside past the walls that stand there.
     """
     walls, kept_free = 0, NEAR[start] | NEAR[end]
-    for (place, around), die in zip(INSIDE, tape.dice(len(INSIDE)), strict=True):
-        if die < 33:
+    for (place, around), hit in zip(INSIDE, tape.chances(len(INSIDE)), strict=True):
+        if hit:
             walls |= place
             kept_free |= around
     free = [place for place in BORDER if not place & kept_free]
@@ -320,9 +333,8 @@ def draw_path(tape: Tape, walls: int, start: int, end: int) -> list[int]:
     """The path that A* finds over random costs, not always the cheapest: its places from start to end."""
     words, used, closed = tape.words, tape.used, walls
     cost, total, previous = [0] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
-    distance, opened, here = DISTANCES[end], [start], start
+    distance, opened, here = DISTANCES[end], [], start
     while here != end:
-        opened.remove(here)
         closed |= 1 << here
         so_far = cost[here] + 1
         for place, bit in NEIGHBOURS[here]:
@@ -337,12 +349,13 @@ def draw_path(tape: Tape, walls: int, start: int, end: int) -> list[int]:
                 # The original leaves the higher cost as it is.
                 previous[place] = here
         # Not the least total: the first that is less than the first of all, as in the original.
-        least = total[opened[0]]
-        for here in opened:
-            if total[here] < least:
+        here = opened[0]
+        least = total[here]
+        for place in opened:
+            if total[place] < least:
+                here = place
                 break
-        else:
-            here = opened[0]
+        opened.remove(here)
     tape.used = used
     path = [end]
     while here != start:
@@ -354,7 +367,11 @@ def draw_path(tape: Tape, walls: int, start: int, end: int) -> list[int]:
 def write_level(s: State, lane: int, level: Level, values: dict[str, Any], variant: Variant) -> None:
     """Starts the lane's episode at this level."""
     s.step_at[lane] = PIT
-    s.known[lane] = s.fallen[lane] = s.fresh[lane] = s.restful[lane] = False
+    s.known[lane] = s.fallen[lane] = s.hurt[lane] = s.fresh[lane] = s.restful[lane] = False
+    if s.past[lane]:
+        s.past[lane] = False
+        others = s.trail_lane != lane
+        s.trail_lane, s.trail_x, s.trail_y = s.trail_lane[others], s.trail_x[others], s.trail_y[others]
     s.count[lane] = s.segments[lane] = s.furthest[lane] = s.fails[lane] = s.visited[lane] = 0
     s.length[lane] = s.returned[lane] = 0
     write_path(s, lane, level, variant)
@@ -373,13 +390,13 @@ def write_level(s: State, lane: int, level: Level, values: dict[str, Any], varia
 def write_path(s: State, lane: int, level: Level, variant: Variant) -> None:
     """Appends to the lane's path, for which there must be room."""
     first, segment = int(s.count[lane]) + 1, int(s.segments[lane])
-    last = first + len(level.path)
-    headings = [HEADINGS[there - here] for here, there in pairwise(level.path)]
+    last, path = first + len(level.path), np.array(level.path)
+    s.cell[lane, first:last] = path
+    s.step_at[lane, path] = np.arange(first, last)
+    headings = HEADINGS.take(path[1:] - path[:-1] + ROWS)
+    s.heading_at[lane, first : last - 1] = headings
     # Behind a transition tile the path goes on to the right. The goal has the direction that leads to it.
-    headings.append(EAST if variant.endless else headings[-1])
-    s.cell[lane, first:last] = level.path
-    s.step_at[lane, level.path] = np.arange(first, last)
-    s.heading_at[lane, first:last] = headings
+    s.heading_at[lane, last - 1] = EAST if variant.endless else headings[-1]
     s.fresh[lane, first:last] = s.restful[lane, first:last] = True
     s.walls[lane, segment : segment + len(level.walls)] = level.walls
     s.count[lane] = last - 1
@@ -472,41 +489,29 @@ def tile_centres(cell: np.ndarray) -> np.ndarray:
 
 def draw_endless_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     """(n, FRAME): black or the background, and the path behind the agent where it is shown."""
-    column, walked = s.tile[lanes, 0], s.pos[lanes, 0] - s.origin[lanes, 0]
     if np.count_nonzero(s.extras[lanes]):
         # Starts again as soon as it has moved by a tile or more, which jumps if the speed does not divide that.
+        walked = s.pos[lanes, 0] - s.origin[lanes, 0]
         frames = grounds().take((walked % s.lap[lanes] + 1) * s.show_ground[lanes], axis=0)
     else:
-        frames = np.zeros((len(column), FRAME), np.uint8)
-    (which,) = ((np.minimum(column, s.at[lanes] - 1) > 0) & s.show_past[lanes]).nonzero()
-    if which.size:
-        owner, cell = trail(s, which if isinstance(lanes, slice) else lanes[which])
-        draw_trail(frames, which[owner], cell, walked - s.camera[lanes])
+        frames = np.zeros((len(s.at[lanes]), FRAME), np.uint8)
+    if np.count_nonzero(s.past[lanes]):
+        draw_trail(frames, s, lanes)
     return frames
 
 
-def trail(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The path behind the agents: for each tile, (m,), which of the lanes it belongs to, and its cell.
-
-    From the last step but one backwards, up to the first that is as far to the left as the camera's offset in tiles.
-    """
-    at = s.at[lanes]
-    bound = np.maximum(s.tile[lanes, 0] - s.depth[lanes], 1) * ROWS  # (n,) cells below that are far enough left
-    back = BACK[: int(at.max())]  # (K,)
-    steps = at[:, None] - back  # (n, K)
-    np.maximum(steps, PIT, out=steps)
-    cells = s.cell.take(steps + lanes[:, None] * s.cell.shape[1])  # (n, K)
-    # At the latest, a trail ends at the pit, whose cell is left of everything.
-    last = (cells < bound[:, None]).argmax(axis=1)  # (n,)
-    owner, which = np.nonzero((back <= last[:, None] + 1) & (cells != NOWHERE))
-    return owner, cells[owner, which]
-
-
-def draw_trail(frames: np.ndarray, owner: np.ndarray, cell: np.ndarray, camera: np.ndarray) -> None:
-    """Draws the cells' tiles on their owners' frames, in place. camera: (n,) the screen's left edge on the path."""
-    column, row = np.divmod(cell, ROWS)
+def draw_trail(frames: np.ndarray, s: State, lanes: np.ndarray | slice) -> None:
+    """Draws the past path on the lanes' frames, in place."""
+    lane, y = s.trail_lane, s.trail_y  # (m,)
     # A camera between two pixels cuts the fraction off, towards zero.
-    x, y = (column * TILE - camera[owner]).astype(np.int64), (row - BEYOND) * TILE
+    x = (s.trail_x - (s.pos[:, 0] - s.origin[:, 0] - s.camera)[lane]).astype(np.int64)
+    if isinstance(lanes, slice):
+        owner = lane
+    else:
+        frame = np.full(len(s.at), NOWHERE)
+        frame[lanes] = np.arange(len(lanes))
+        mine = frame[lane] != NOWHERE
+        owner, x, y = frame[lane[mine]], x[mine], y[mine]
     whole = (x >= 0) & (x <= SCREEN - TILE)
     if np.count_nonzero(whole) < len(whole):
         cut = ~whole & (x > -TILE) & (x < SCREEN)
@@ -519,17 +524,18 @@ def draw_trail(frames: np.ndarray, owner: np.ndarray, cell: np.ndarray, camera: 
 
 def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: np.ndarray | slice, endless: bool) -> None:
     """Draws the agents, their stamina and their crosses on the frames (n, FRAME), in place."""
-    pos = s.pos[lanes]
+    pos, extras = s.pos[lanes], endless and np.count_nonzero(s.extras[lanes])
     if endless:
-        pos = np.maximum(pos, 0)
-        np.minimum(pos, SPAN - 1, out=pos)  # off the screen
+        pos = pos.copy()
         pos[:, 0] = s.figure_x[lanes]
+        if extras:  # a fast agent may be far off the screen
+            np.clip(pos, 0, SPAN - 1, out=pos)
     paste(frames, sheet, s.figure[lanes] * FACINGS + s.facing[lanes], pos)
-    if np.count_nonzero(s.extras[lanes]):
+    if extras:
         shown = s.show_stamina[lanes]
         spent = (SCREEN * (1 - s.stamina[lanes] / s.stamina_level[lanes])).astype(np.int64)  # (n,) pixels
         frames.reshape(-1, SCREEN, ROW)[shown, :, -3 * BAR :] = bars()[spent[shown]]
-    (which,) = (s.fallen[lanes] & s.feedback[lanes]).nonzero()
+    (which,) = s.hurt[lanes].nonzero()
     if which.size:
         cross = pos[which]
         if endless:
@@ -559,9 +565,40 @@ def land(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: bool) ->
     if np.count_nonzero(s.fallen):
         rewards += s.fallen * s.reward_fall_off
         s.fails += s.fallen
+    s.hurt = s.fallen & s.feedback
     heading = s.heading_at.take(s.at + lane_path)
-    # The endless id's ground truth has no entry for the west.
-    s.heading = np.where(heading == WEST, s.heading, heading) if endless else heading
+    if endless:
+        # The ground truth has no entry for the west.
+        heading = np.where(heading == WEST, s.heading, heading)
+        s.past = s.show_past & (np.minimum(s.tile[:, 0], s.at - 1) > 0)
+        follow(s)
+    s.heading = heading
+
+
+def follow(s: State) -> None:
+    """Finds the path behind the agents that is shown."""
+    (lanes,) = s.past.nonzero()
+    if lanes.size:
+        owner, cell = trail(s, lanes)
+        column, row = np.divmod(cell, ROWS)
+        s.trail_lane, s.trail_x, s.trail_y = lanes[owner], column * TILE, (row - BEYOND) * TILE
+
+
+def trail(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The path behind the agents: for each tile, (m,), which of the lanes it belongs to, and its cell.
+
+    From the last step but one backwards, up to the first that is as far to the left as the camera's offset in tiles.
+    """
+    at = s.at[lanes]
+    bound = np.maximum(s.tile[lanes, 0] - s.depth[lanes], 1) * ROWS  # (n,) cells below that are far enough left
+    back = BACK[: int(at.max())]  # (K,)
+    steps = at[:, None] - back  # (n, K)
+    np.maximum(steps, PIT, out=steps)
+    cells = s.cell.take(steps + lanes[:, None] * s.cell.shape[1])  # (n, K)
+    # At the latest, a trail ends at the pit, whose cell is left of everything.
+    last = (cells < bound[:, None]).argmax(axis=1)  # (n,)
+    owner, which = np.nonzero((back <= last[:, None] + 1) & (cells != NOWHERE))
+    return owner, cells[owner, which]
 
 
 def rest(s: State, lane_path: np.ndarray) -> None:
@@ -644,7 +681,8 @@ class MysteryPath(MemoryGymVectorEnv):
         s.feedback[lanes] = values["visual_feedback"]
         for what, option in SHOWN.items():
             getattr(s, f"show_{what}")[lanes] = values.get(option, False)
-        s.extras[lanes] = any(values.get(option, False) for what, option in SHOWN.items() if what != "past")
+        shown = any(values.get(option, False) for what, option in SHOWN.items() if what != "past")
+        s.extras[lanes] = shown or values.get("agent_speed", 0.0) > PAD
         s.reward_goal[lanes] = values.get("reward_goal", 0.0)
         s.reward_fall_off[lanes] = values["reward_fall_off"]
         s.reward_progress[lanes] = values["reward_path_progress"]
@@ -702,9 +740,11 @@ class MysteryPath(MemoryGymVectorEnv):
         s, endless = self.state, self.variant.endless
         s.length += 1
         self._move(actions)
-        s.tile = (s.pos - PAD) // TILE  # (N, 2)
         if endless:
+            s.tile = (s.pos - PAD) // TILE  # (N, 2)
             self._lengthen()
+        else:
+            s.tile = TILE_AT.take(s.pos)  # (N, 2)
         cell = s.tile.dot(MAP_STRIDES) + self._lane_map  # (N,)
         before, s.step = s.step, s.step_at.take(cell)
         s.fallen = s.step == PIT

@@ -9,6 +9,7 @@ from players import player, stumbling, turn_or_walk
 
 from memory_gym_envs import MysteryPath
 from memory_gym_envs.mystery_path import (
+    AGAIN,
     BEYOND,
     EAST,
     FIRST_SEGMENTS,
@@ -19,6 +20,7 @@ from memory_gym_envs.mystery_path import (
     SIDE,
     SOUTH,
     TILE,
+    WALL_WORDS,
     WEST,
     Tape,
     draw_segments,
@@ -132,6 +134,16 @@ def test_tape_draws_what_the_generator_would():
         tape.close()
         assert drawn == [one_by_one.integers(0, limit) for limit in limits]
         assert ahead.bit_generator.state == one_by_one.bit_generator.state
+
+
+def test_tape_finds_the_words_that_are_drawn_again():
+    tape = Tape(np.random.default_rng(0), 1)
+    twin = Tape(np.random.default_rng(0), 1)
+    for word in (*AGAIN, WALL_WORDS - 1, WALL_WORDS, 0, 2**32 - 1):
+        for each in (tape, twin):
+            each.used, each.words[3] = 0, word
+        assert tape.chances(8) == [twin.below(100) < 33 for _ in range(8)]
+        assert tape.used == twin.used == 8 + (word in AGAIN)
 
 
 # ---- falling off ----
