@@ -19,6 +19,7 @@ from memory_gym_envs.character import (
     STRIDES,
     Figure,
     free_controls,
+    hand_places,
     radius_of,
     walk,
     wardrobe,
@@ -40,9 +41,10 @@ GONE = 1000  # where bodies are that do not exist, in pixels
 AWAY = -1000  # where spotlights are that do not exist
 
 # What is known of a spotlight, a row of State.spots. Its place at time t is START + t * (TOWARD + t * BEND).
-TIME, SPEED, RADIUS, REACH = range(4)
-START, TOWARD, BEND = slice(4, 6), slice(6, 8), slice(8, 10)
-NO_SPOT = np.array([0.0, 0.0, 0.0, -1.0, AWAY, AWAY, 0.0, 0.0, 0.0, 0.0])  # (10,)
+# It hurts within REACH of the agent's centre and may show a part of it within SIGHT, both squared.
+TIME, SPEED, RADIUS, REACH, SIGHT = range(5)
+START, TOWARD, BEND = slice(5, 7), slice(7, 9), slice(9, 11)
+NO_SPOT = np.array([0.0, 0.0, 0.0, -1.0, -1.0, AWAY, AWAY, 0.0, 0.0, 0.0, 0.0])  # (11,)
 
 PLACES, PLACE_0 = 256, 64  # spotlights are at -64 .. 191 on both axes
 NO_KEY = -AWAY  # brings a spotlight that does not exist to place 0
@@ -138,11 +140,11 @@ class State:
     collected: np.ndarray  # (N,) coins so far
     coin_age: np.ndarray  # (N,) steps since the coin appeared (endless)
     success: np.ndarray  # (N,) 1 when the task is done
-    spots: np.ndarray  # (10, N, S) float64: the spotlights, oldest first; see TIME .. BEND
+    spots: np.ndarray  # (11, N, S) float64: the spotlights, oldest first; see TIME .. BEND
     spot_key: np.ndarray  # (N, S) where the radius begins in the lamps' tables, with PLACE_0 added; or NO_KEY
     count: np.ndarray  # (N,) spotlights
-    spot: np.ndarray  # (2, N, S) float64: x and y where each one shines; AWAY where it doesn't
-    place: np.ndarray  # (2, N, S) the same as indices of the lamps' tables; 0 where it doesn't
+    place: np.ndarray  # (2, N, S) where each one shines, x and y as indices of the lamps' tables; 0 where it doesn't
+    seen: np.ndarray  # (N,) bool: some of the agent may be in the light
     wait: np.ndarray  # (N,) steps until the next one
     spawns: np.ndarray  # (N,) spotlights to follow
     health: np.ndarray  # (N,) float64
@@ -185,14 +187,11 @@ def empty_state(lanes: int) -> State:
     """The state of N lanes before their first reset, with room for no coin and one spotlight."""
     shapes = {"pos": (lanes, 2), "bodies": (2, lanes, COIN), "touch": (lanes, COIN)}
     shapes |= {"goal": (lanes, 4), "spots": (len(NO_SPOT), lanes, 1), "spot_key": (lanes, 1), "darkness": (lanes, FADE)}
-    shapes |= dict.fromkeys(("spot", "place"), (2, lanes, 1)) | {"scenery": (2 * lanes, FRAME), "floors": (lanes, 2)}
-    floats = ("touch", "goal", "spots", "spot", "health", "returned", "full", "damage")
+    shapes |= {"place": (2, lanes, 1), "scenery": (2 * lanes, FRAME), "floors": (lanes, 2)}
+    floats = ("touch", "goal", "spots", "health", "returned", "full", "damage")
     rewards = ("reward_inside", "reward_outside", "reward_death", "reward_coin", "reward_exit")
-    kinds = (
-        dict.fromkeys((*floats, *rewards), np.float64)
-        | {"rim": bool, "layered": bool}
-        | dict.fromkeys(("darkness", "scenery"), np.uint8)
-    )
+    kinds = dict.fromkeys((*floats, *rewards), np.float64) | dict.fromkeys(("seen", "rim", "layered"), bool)
+    kinds |= dict.fromkeys(("darkness", "scenery"), np.uint8)
     names = State.__dataclass_fields__
     return State(**{name: np.zeros(shapes.get(name, (lanes,)), kinds.get(name, np.int64)) for name in names})
 
@@ -212,7 +211,7 @@ def make_room(s: State, coins: int = 0, spots: int = 0) -> None:
     if spots > old:
         s.spots, s.spot_key = widened(s.spots, spots), widened(s.spot_key, spots, NO_KEY)
         s.spots[:, :, old:] = NO_SPOT[:, None, None]
-        s.spot, s.place = widened(s.spot, spots, AWAY), widened(s.place, spots)
+        s.place = widened(s.place, spots)
 
 
 # ---- levels ----
@@ -304,8 +303,16 @@ def draw_spot(rng: np.random.Generator, values: dict[str, Any]) -> list[float]:
     x, y = (MIDDLE + far * part for part in UNITS[start])
     to_x, to_y = (MIDDLE + far * part for part in UNITS[target])
     off_x, off_y = (MIDDLE + far * part for part in UNITS[offset])
-    reach = (radius + radius_of(values["agent_scale"])) ** 2
-    return [0.0, speed, radius, reach, x, y, to_x - x, to_y - y, off_x - to_x, off_y - to_y]
+    reach, sight = radius + radius_of(values["agent_scale"]), radius + _extent(values["agent_scale"])
+    path = [x, y, to_x - x, to_y - y, off_x - to_x, off_y - to_y]
+    return [0.0, speed, radius, reach * reach, sight * sight, *path]
+
+
+@cache
+def _extent(scale: float) -> float:
+    """How far from the agent's centre a spotlight may end and still show some of it, in pixels."""
+    hands = max(math.hypot(*place) for facing in range(FACINGS) for place in hand_places(scale, facing))
+    return max(radius_of(scale), hands + int(10 * scale)) + 3  # as both are drawn at whole pixels
 
 
 def _unit(degrees: int) -> tuple[float, float]:
@@ -331,6 +338,8 @@ def write_level(s: State, lane: int, level: Level, spawns: int) -> None:
     coins = len(level.coins)
     make_room(s, spots=len(level.spots))
     # Before the first step the agent is drawn facing up wherever it faces, as in the original.
+    if s.look is s.facing:
+        s.look = s.look.copy()
     s.facing[lane], s.look[lane] = level.facing, 0
     s.bodies[:, lane] = GONE
     s.bodies[:, lane, AGENT] = level.pos
@@ -347,7 +356,7 @@ def write_level(s: State, lane: int, level: Level, spawns: int) -> None:
     if level.spots:
         s.spots[:, lane, : len(level.spots)] = np.array(level.spots).T
         s.spot_key[lane, : len(level.spots)] = [spot[RADIUS] * PLACES + PLACE_0 for spot in level.spots]
-    s.spot[:, lane], s.place[:, lane] = AWAY, 0  # they shine from the first step on
+    s.place[:, lane], s.seen[lane] = 0, False  # they shine from the first step on
     s.spawns[lane], s.wait[lane] = spawns, s.interval[lane] if spawns else NO_LIMIT
     s.health[lane] = s.full[lane]
     s.floor[lane] = 2 * lane
@@ -541,9 +550,10 @@ class Art(NamedTuple):
 
 def draw(s: State, art: Art, lanes: np.ndarray | slice) -> np.ndarray:
     """Fresh frames of the lanes, (n, 84, 84, 3) uint8, from the state alone."""
-    frames = scene(s, art, lanes)
+    dim = (s.length < s.dark_at)[lanes]  # (n,) the darkness is not just black
+    frames = scene(s, art, lanes, s.seen[lanes] | dim)
     lit, rim = shine(s, art.lamps, lanes)
-    darken(s, lanes, frames, pixels(lit), rim)
+    darken(s, lanes, frames, pixels(lit), rim, np.flatnonzero(dim))
     coins = s.coin_age[lanes] < s.coin_show[lanes]
     if np.count_nonzero(coins):
         put_coins(s, art, lanes, frames, coins)
@@ -557,10 +567,10 @@ def draw(s: State, art: Art, lanes: np.ndarray | slice) -> np.ndarray:
     return frames.reshape(-1, SCREEN, SCREEN, 3)
 
 
-def scene(s: State, art: Art, lanes: np.ndarray | slice) -> np.ndarray:
-    """The lanes in full light: (n, FRAME) uint8."""
+def scene(s: State, art: Art, lanes: np.ndarray | slice, seen: np.ndarray | bool) -> np.ndarray:
+    """The lanes in full light, with the agents that are seen, (n,) bool or just True: (n, FRAME) uint8."""
     frames = s.scenery.take(s.floor[lanes], axis=0)
-    put_agent(s, art, lanes, frames, True)
+    put_agent(s, art, lanes, frames, seen)
     return frames
 
 
@@ -588,17 +598,18 @@ def put_exit(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, 
 
 def put_agent(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool) -> None:
     """Draws the agents of the lanes that are shown, (n,) bool, into the frames, in place."""
-    put(frames, art.figures, (s.figure * FACINGS + s.look)[lanes], s.pos[lanes], shown)
+    if shown is True or np.count_nonzero(shown):
+        put(frames, art.figures, (s.figure * FACINGS + s.look)[lanes], s.pos[lanes], shown)
 
 
 def put(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, shown: np.ndarray | bool) -> None:
     """Pastes sprite rows[i] of the sheet at pos[i] into those of the frames that are shown, (n,) bool or just True."""
-    if shown is True or np.count_nonzero(shown) == len(rows):
+    count = len(rows) if shown is True else np.count_nonzero(shown)
+    if count == len(rows):
         paste(frames, sheet, rows, pos)
-    else:
+    elif count:
         at = np.flatnonzero(shown)
-        if at.size:
-            paste(frames, sheet, rows[at], pos[at], at)
+        paste(frames, sheet, rows[at], pos[at], at)
 
 
 def put_layer(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, layer: int) -> None:
@@ -628,12 +639,19 @@ def _words(windows: np.ndarray) -> np.ndarray:
     return windows.view(np.uint64).reshape(*windows.shape, -1)
 
 
-def darken(s: State, lanes: np.ndarray | slice, frames: np.ndarray, lit: np.ndarray, rim: np.ndarray | None) -> None:
+def darken(
+    s: State,
+    lanes: np.ndarray | slice,
+    frames: np.ndarray,
+    lit: np.ndarray,
+    rim: np.ndarray | None,
+    dim: np.ndarray,
+) -> None:
     """Lays the darkness over the lanes' frames, (n, FRAME), in place.
 
     lit: (n, FRAME) mask of what it leaves out. rim: (n, 504) bits of it that are white, or None.
+    dim: those of the n lanes where it is not just black.
     """
-    dim = np.flatnonzero(s.length[lanes] < s.dark_at[lanes])  # where it is not just black
     if dim.size:
         who = dim if isinstance(lanes, slice) else lanes[dim]
         opacity = s.darkness[who, np.minimum(s.length[who], FADE - 1)].astype(np.uint16)[:, None]
@@ -864,7 +882,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         action = actions[:, 0] * 3 + actions[:, 1]  # (N,)
         s.shown_action, s.last_action = s.last_action, action
         s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._wardrobe.walk)
-        s.look = s.facing.copy()
+        s.look = s.facing
         np.subtract(s.pos.T, PAD, out=s.bodies[:, :, AGENT])
 
     def _spawn(self, lane: int) -> None:
@@ -886,20 +904,18 @@ class SearingSpotlights(MemoryGymVectorEnv):
         spot += s.spots[START]
         place = spot.astype(np.int64)
         place += s.spot_key
-        gap = spot - s.bodies[:, :, :1]
-        gap *= gap
-        inside = gap[0] + gap[1] <= s.spots[REACH]
+        spot -= s.bodies[:, :, :1]
+        spot *= spot
+        distance = spot[0] + spot[1]  # (N, S) squared
         if pausing is None:
             time += s.spots[SPEED]
         else:
             held = time[pausing]
             time += s.spots[SPEED]
-            time[pausing] = held
-            inside[pausing] = False
-            spot[(ALL, *pausing)], place[(ALL, *pausing)] = AWAY, 0
+            time[pausing], distance[pausing], place[(ALL, *pausing)] = held, np.inf, 0
         self._through = np.count_nonzero(time >= 1.0) > 0
-        s.spot, s.place = spot, place
-        return inside.any(axis=1)
+        s.place, s.seen = place, (distance <= s.spots[SIGHT]).any(axis=1)
+        return (distance <= s.spots[REACH]).any(axis=1) if np.count_nonzero(s.seen) else s.seen
 
     def _collect(self, touched: np.ndarray, rewards: np.ndarray) -> None:
         """Takes the coins that are touched, (N, B) bool; the endless id then has a new one."""
@@ -962,7 +978,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Lights everything below the bar, and circles the spotlights."""
         s, lanes = self.state, np.array([lane])
-        lit = scene(s, self._art, lanes)
+        lit = scene(s, self._art, lanes, True)
         below = slice(BAR * DEBUG_ZOOM, None)
         frame[below] = magnify(lit.reshape(SCREEN, SCREEN, 3), DEBUG_ZOOM)[below]
         for slot in np.flatnonzero(s.place[0, lane]).tolist():

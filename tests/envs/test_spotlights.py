@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from players import player
 
-from memory_gym_envs.searing_spotlights import AGENT, COIN, EXIT, GONE, REACH, TIME
+from memory_gym_envs.searing_spotlights import AGENT, COIN, EXIT, GONE, RADIUS, REACH, SIGHT, SPEED, TIME
 
 FINITE, ENDLESS = "SearingSpotlights-v0", "Endless-SearingSpotlights-v0"
 SAFE = {"spot_damage": 0}
@@ -160,7 +160,7 @@ def test_dying_at_the_exit_pays_but_is_no_success():
     assert info["success"] == 1
     # The same step again, but with the last health lost in it.
     s = earlier.batch.state
-    s.spots[REACH, 0, 0], s.health[0] = 1e6, 1.0
+    s.spots[[REACH, SIGHT], 0, 0], s.health[0] = 1e6, 1.0
     _, reward, terminated, _, info = earlier.step(player(earlier.batch)[0])
     assert terminated
     assert (reward, info["success"], info["coins_collected"], info["agent_health"]) == (0.5, 0, 1.0, 0.0)
@@ -249,7 +249,7 @@ def test_smallest_above_largest_replaces_it(low_high):
     value = 20.0 if "radius" in low else 0.02
     env, _ = make(FINITE)
     env.reset(seed=0, options={low: value, high: value / 2, "initial_spawns": 10})
-    drawn = env.batch.state.spots[2 if "radius" in low else 1, 0, :10]
+    drawn = env.batch.state.spots[RADIUS if "radius" in low else SPEED, 0, :10]
     assert (drawn == value).all()
 
 
