@@ -123,7 +123,7 @@ def paste(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, o
 
 def _paste_one(frames: np.ndarray, sheet: Sheet, row: int, pos: np.ndarray, owner: int) -> None:
     """Pastes one sprite: the same as `paste`, in fewer calls."""
-    place = pos[1] * sheet.positions + pos[0]
+    place = pos.dot(sheet.strides)
     start = 3 * (sheet.frame_start[place] + owner * (SCREEN * SCREEN))
     source = 3 * (sheet.canvas_start[place] + row * (sheet.canvas * sheet.canvas))
     square, pitch = (sheet.row.itemsize // 3, sheet.row.itemsize), (3 * sheet.canvas, 1)
