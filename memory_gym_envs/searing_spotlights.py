@@ -64,19 +64,26 @@ class Variant:
     options: tuple[Option, ...]
 
 
+UNUSED = "ignored, as in the original"
+
+
 def _options(endless: bool) -> tuple[Option, ...]:
     """The reset options of an id, in the original's order of names."""
-    finite, (small, large) = not endless, SPOT_RADII
-    unused, least = "ignored, as in the original", "; {} where that is larger"
+    return tuple(option for present, option in _light_rows(endless) + _body_rows(endless) if present)
+
+
+def _light_rows(endless: bool) -> list[tuple[bool, Option]]:
+    """Time and light: which options an id has, and what they are."""
+    finite, (small, large), least = not endless, SPOT_RADII, "; {} where that is larger"
     steps, deadline = "steps until truncation; -1: no limit", "steps to collect a coin in; -1: no limit"
-    rows = [
+    return [
         (True, Option("max_steps", -1 if endless else 256, "int", 1, None, steps, also=(-1,))),
         (endless, Option("steps_per_coin", 160, "int", 1, None, deadline, also=(-1,))),
         (True, Option("initial_spawns", 3 if endless else 4, "int", 0, 100, "spotlights at the start")),
         (finite, Option("num_spawns", 30, "int", 0, None, "spotlights that follow")),
         (finite, Option("initial_spawn_interval", 30, "int", 0, None, "steps between them, but for the next")),
         (finite, Option("spawn_interval_threshold", 10, "int", 0, None, "steps added to those")),
-        (finite, Option("spawn_interval_decay", 0.95, "float", 0.0, 1.0, unused)),
+        (finite, Option("spawn_interval_decay", 0.95, "float", 0.0, 1.0, UNUSED)),
         (endless, Option("spawn_interval", 50, "int", 1, None, "steps between the spotlights that follow")),
         (True, Option("spot_min_radius", 7.5, "float", small, large, "smallest radius of a spotlight, rounded down")),
         (True, Option("spot_max_radius", 13.75, "float", small, large, "largest" + least.format("the smallest"))),
@@ -88,6 +95,13 @@ def _options(endless: bool) -> tuple[Option, ...]:
         (True, Option("hide_chessboard", False, "bool", None, None, "white floor, which never reddens")),
         (True, Option("light_dim_off_duration", 6, "int", 0, 255, "steps in which the light goes out; 0: it is out")),
         (True, Option("light_threshold", 255, "int", 0, 255, "darkness that dimming goes on until; 255: black")),
+    ]
+
+
+def _body_rows(endless: bool) -> list[tuple[bool, Option]]:
+    """Coins, exit, agent and rewards, likewise."""
+    finite = not endless
+    return [
         (finite, Option("num_coins", (1,), "ints", 0, MOST_COINS, "coins to collect *", empty=True)),
         (True, Option("coin_scale", 0.375, "float", 0.1, 2.0, "size of a coin; 0.375: 6 pixels wide")),
         (endless, Option("coin_show_duration", 6, "int", 0, None, "steps that a new coin is visible in the dark")),
@@ -107,10 +121,9 @@ def _options(endless: bool) -> tuple[Option, ...]:
         (True, Option("reward_outside_spotlight", 0.0, "float", None, None, "reward for each step in the dark")),
         (True, Option("reward_death", 0.0, "float", None, None, "added when no health is left")),
         (finite, Option("reward_exit", 1.0, "float", None, None, "reward for leaving")),
-        (finite, Option("reward_max_steps", 0.0, "float", None, None, unused)),
+        (finite, Option("reward_max_steps", 0.0, "float", None, None, UNUSED)),
         (True, Option("reward_coin", 0.25, "float", None, None, "reward for each coin")),
     ]
-    return tuple(option for present, option in rows if present)
 
 
 VARIANTS = {
@@ -488,9 +501,12 @@ def _pixels() -> np.ndarray:
     return (bits.astype(np.uint8) * np.uint8(255)).repeat(3, axis=1).view(f"V{3 * ITEM}")[:, 0]
 
 
-def pixels(bits: np.ndarray) -> np.ndarray:
-    """Bits of frames, (n, 504) uint16, as a mask for frames: (n, FRAME) uint8, 255 where set."""
-    return _pixels().take(bits).view(np.uint8)
+def pixels(bits: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    """Bits of frames, (n, 504) uint16, as a mask for frames: (n, FRAME) uint8, 255 where set.
+
+    out: (n, 504) items of 42 bytes to write it to, which costs less than fresh memory.
+    """
+    return _pixels().take(bits, out=out, mode="clip").view(np.uint8)
 
 
 @lru_cache(maxsize=16)
@@ -546,6 +562,7 @@ class Art(NamedTuple):
     figures: Sheet
     props: Sheet
     bars: np.ndarray
+    mask: np.ndarray  # (N, 504) scratch for pixels()
 
 
 def draw(s: State, art: Art, lanes: np.ndarray | slice) -> np.ndarray:
@@ -553,7 +570,7 @@ def draw(s: State, art: Art, lanes: np.ndarray | slice) -> np.ndarray:
     dim = (s.length < s.dark_at)[lanes]  # (n,) the darkness is not just black
     frames = scene(s, art, lanes, s.seen[lanes] | dim)
     lit, rim = shine(s, art.lamps, lanes)
-    darken(s, lanes, frames, pixels(lit), rim, np.flatnonzero(dim))
+    darken(s, lanes, frames, pixels(lit, art.mask[: len(lit)]), rim, np.flatnonzero(dim))
     coins = s.coin_age[lanes] < s.coin_show[lanes]
     if np.count_nonzero(coins):
         put_coins(s, art, lanes, frames, coins)
@@ -655,11 +672,14 @@ def darken(
     if dim.size:
         who = dim if isinstance(lanes, slice) else lanes[dim]
         opacity = s.darkness[who, np.minimum(s.length[who], FADE - 1)].astype(np.uint16)[:, None]
-        bright = frames[dim]
-        veiled = bright - (bright * opacity // 255).astype(np.uint8)
+        bright = frames[dim].astype(np.uint16)
+        # What is left is rounded up, as what the original takes away is rounded down.
+        veiled = bright * (255 - opacity)
+        veiled += 254
+        veiled //= 255
         if rim is not None:
-            white = pixels(rim[dim]) > 0
-            veiled[white] = (bright + ((255 - bright) * opacity // 255).astype(np.uint8))[white]
+            np.copyto(veiled, bright + (255 - bright) * opacity // 255, where=pixels(rim[dim]) > 0)
+        veiled = veiled.astype(np.uint8)
         veiled &= ~lit[dim]
     frames &= lit
     if dim.size:
@@ -825,7 +845,8 @@ class SearingSpotlights(MemoryGymVectorEnv):
         self._wardrobe = wardrobe(tuple(figure for pair in self.figures for figure in pair))
         radii = [values[name] for values in self.settings for name in ("spot_min_radius", "spot_max_radius")]
         spots = lamps(int(min(radii)), int(max(radii)))
-        self._art = Art(spots, self._wardrobe.sheet, props(self.scales), bars(self.variant.endless))
+        mask = np.empty((self.num_envs, ITEMS * SCREEN), _pixels().dtype)
+        self._art = Art(spots, self._wardrobe.sheet, props(self.scales), bars(self.variant.endless), mask)
         self._controls = free_controls()
         self._calm = np.arange(0, 2 * self.num_envs, 2)  # (N,) the scenery's calm rows
         self._lane_walk = (self.state.figure[:, None] + np.arange(2)) * (STRIDES * SPAN)  # (N, 2)
