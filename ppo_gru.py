@@ -34,7 +34,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 import tyro
-from gymnasium.utils.save_video import capped_cubic_video_schedule
 from gymnasium.vector import AutoresetMode
 from torch import Tensor, nn
 from torch.distributions import Categorical
@@ -278,12 +277,14 @@ class LaneRecorder:
         self.envs, self.folder, self.max_frames = envs, folder, max_frames
         self.episode, self.frames = 0, []
         self.write = require("moviepy.video.io.ImageSequenceClip", "--capture-video", "play").ImageSequenceClip
+        # Gymnasium's module imports moviepy as well, so it must not be imported without the extra.
+        self.is_due = importlib.import_module("gymnasium.utils.save_video").capped_cubic_video_schedule
         if not isinstance((envs.render() or [None])[0], np.ndarray):
             raise ValueError("--capture-video needs an environment that draws pictures (render_mode rgb_array)")
 
     def capture(self) -> None:
         """Keep a frame of the episode that is being played, if it is one to record."""
-        if capped_cubic_video_schedule(self.episode) and len(self.frames) < self.max_frames:
+        if self.is_due(self.episode) and len(self.frames) < self.max_frames:
             self.frames.append(self.envs.render()[0])
 
     def end_episode(self) -> None:

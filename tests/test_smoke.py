@@ -210,6 +210,13 @@ def test_command_line(tmp_path):
     assert (folder / "model.pt").exists()
 
 
+def test_the_script_needs_no_extra():
+    """What only an extra brings must not be imported with the script."""
+    extras = ("moviepy", "wandb", "pygame", "matplotlib", "pytest")
+    code = f"import sys; sys.modules.update(dict.fromkeys({extras})); import ppo_gru"
+    subprocess.run([sys.executable, "-c", code], cwd=os.path.dirname(SCRIPT), check=True, timeout=300)
+
+
 def test_help():
     shown = subprocess.run([sys.executable, SCRIPT, "--help"], capture_output=True, text=True, timeout=300)
     assert shown.returncode == 0
