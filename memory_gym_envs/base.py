@@ -2,7 +2,8 @@
 
 A family says what its options, spaces, state, rules and pictures are; everything that Gymnasium asks of a vector
 environment (seeds, levels, options kept from reset to reset, same-step autoreset, infos, rendering) is here, once.
-Shape letters: N lanes (parallel environments), n some of them, G entries of the ground truth.
+Shape letters: N lanes (parallel environments), n some of them, G entries of the ground truth, V of a vector
+observation.
 """
 
 import operator
@@ -16,9 +17,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from memory_gym_envs.drawing import magnify
+from memory_gym_envs.entries import vector_space
 from memory_gym_envs.options import resolve
 
 RENDER_MODES = ("rgb_array", "debug_rgb_array")
+OBS_TYPES = ("pixels", "vector")
 DEBUG_ZOOM = 4  # the debug view is 336 x 336
 ALL = slice(None)  # every lane
 NO_LIMIT = np.iinfo(np.int64).max  # of steps
@@ -35,6 +38,8 @@ class MemoryGymVectorEnv(VectorEnv):
         num_levels: with n > 0, every reset without a seed, automatic ones too, plays a level drawn from n; None or 0:
             no limit. A level is what `reset(seed=level)` builds.
         start_level: the first of those n levels.
+        obs_type: "pixels" (the id's own observation space) or "vector": a flat (V,) float32 vector of what the frame
+            shows, and of nothing that it hides; no frame is drawn then. `variant.entries` says what is in it.
 
     Raises ValueError for any other argument value.
 
@@ -51,6 +56,7 @@ class MemoryGymVectorEnv(VectorEnv):
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
     variants: ClassVar[Mapping[str, Any]] = {}
+    tables: ClassVar[tuple[str, ...]] = ("_wardrobe",)  # attributes that place_tables() makes, too large to pickle
 
     def __init__(
         self,
@@ -59,17 +65,23 @@ class MemoryGymVectorEnv(VectorEnv):
         render_mode: str | None = None,
         num_levels: int | None = None,
         start_level: int = 0,
+        obs_type: str = "pixels",
     ):
         if variant not in self.variants:
             raise ValueError(f"variant must be one of {', '.join(self.variants)}, not {variant!r}")
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ValueError(f"render_mode must be None, {' or '.join(map(repr, RENDER_MODES))}, not {render_mode!r}")
+        if obs_type not in OBS_TYPES:
+            raise ValueError(f"obs_type must be {' or '.join(map(repr, OBS_TYPES))}, not {obs_type!r}")
         self.num_envs = _integer("num_envs", num_envs, 1)
         self.num_levels = _integer("num_levels", num_levels or 0, 0)
         self.start_level = _integer("start_level", start_level, 0)
         self.variant_id, self.variant, self.render_mode = variant, self.variants[variant], render_mode
         self.metadata = {**type(self).metadata, "render_fps": self.variant.render_fps}
+        self.obs_type = obs_type
         self.single_observation_space, self.single_action_space = self.spaces()
+        if obs_type == "vector":
+            self.single_observation_space = vector_space(self.variant.entries)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._action_shape = (self.num_envs, *self.single_action_space.shape)
@@ -85,7 +97,7 @@ class MemoryGymVectorEnv(VectorEnv):
     # ---- what a family provides ----
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
-        """The observation and the action space of one lane."""
+        """The observation space of one lane with pixels, and its action space."""
         raise NotImplementedError
 
     def allocate(self) -> None:
@@ -96,6 +108,10 @@ class MemoryGymVectorEnv(VectorEnv):
         """Takes over `self.settings` of the lanes, whose options were just set by an explicit reset."""
         raise NotImplementedError
 
+    def place_tables(self) -> None:
+        """Looks up the tables that follow from the options, and where each lane's rows start in them."""
+        raise NotImplementedError
+
     def begin(self, lane: int, rng: np.random.Generator) -> None:
         """Builds the lane's next level from the generator and starts its episode."""
         raise NotImplementedError
@@ -104,8 +120,12 @@ class MemoryGymVectorEnv(VectorEnv):
         """Applies the rules for one step: rewards, terminations, truncations, each (N,). Resets nothing."""
         raise NotImplementedError
 
-    def observe(self, lanes: np.ndarray | slice) -> Any:
-        """Fresh observations of the lanes, drawn from the state alone."""
+    def pixels(self, lanes: np.ndarray | slice) -> Any:
+        """Fresh observations of the lanes with pixels, drawn from the state alone."""
+        return self.frames(lanes)
+
+    def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh vector observations of the lanes, (n, V) float32: lanes whose frames are equal have equal vectors."""
         raise NotImplementedError
 
     def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
@@ -189,6 +209,17 @@ class MemoryGymVectorEnv(VectorEnv):
         self._rngs[lane], self._seeds[lane] = rng, -1
 
     # ---- parts ----
+
+    def observe(self, lanes: np.ndarray | slice) -> Any:
+        """Fresh observations of the lanes, of the kind that the environment was made for."""
+        return self.vectors(lanes) if self.obs_type == "vector" else self.pixels(lanes)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in self.tables}
+
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        self.__dict__.update(values)
+        self.place_tables()
 
     def resolve(self, options: Mapping[str, Any] | None) -> dict[str, Any]:
         """The complete reset options. Raises ValueError for a wrong one."""

@@ -413,7 +413,7 @@ class MortarMayhem(MemoryGymVectorEnv):
     variants = VARIANTS
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
-        """The observation and the action space of one lane."""
+        """The observation space of one lane with pixels, and its action space."""
         image = gym.spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8)
         vector = gym.spaces.Box(0.0, 1.0, (VECTOR_COMMANDS * len(COMMANDS),), np.float32)
         both = gym.spaces.Dict({"visual_observation": image, "vector_observation": vector})
@@ -425,7 +425,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         self.state = empty_state(self.num_envs)
         self.figures = (self._figure(self.defaults),)  # all that differ, of all lanes
         self._clues_open = False  # whether any lane may still have a clue to see
-        self._place_tables()
+        self.place_tables()
 
     def configure(self, lanes: np.ndarray) -> None:
         """Takes over the options of the lanes, and the tables that all lanes' options need."""
@@ -445,7 +445,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         every = [self._figure(each) for each in self.settings]
         self.figures = tuple(dict.fromkeys(every))
         s.figure[:] = [self.figures.index(figure) for figure in every]
-        self._place_tables()
+        self.place_tables()
 
     def _figure(self, values: dict[str, Any]) -> Figure:
         half = TILE * values.get("arena_size", TORUS_SIZE) // 2
@@ -455,20 +455,12 @@ class MortarMayhem(MemoryGymVectorEnv):
         scale = values["agent_scale"]
         return Figure(scale, values["agent_speed"], low, high, radius_of(scale), self.variant.endless)
 
-    def _place_tables(self) -> None:
+    def place_tables(self) -> None:
         """The flat tables that step() looks things up in, and where each lane's rows start in them."""
         self._wardrobe = wardrobe(self.figures)
         self._controls = grid_controls() if self.variant.grid else free_controls()
         self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
         self._lane_clue = np.arange(self.num_envs) * self.state.clue.shape[1]  # (N,)
-
-    def __getstate__(self) -> dict[str, Any]:
-        # The tables are large and follow from the options.
-        return {name: value for name, value in self.__dict__.items() if name != "_wardrobe"}
-
-    def __setstate__(self, values: dict[str, Any]) -> None:
-        self.__dict__.update(values)
-        self._place_tables()
 
     def begin(self, lane: int, rng: np.random.Generator) -> None:
         """Draws the lane's next level and starts its episode."""
@@ -543,8 +535,8 @@ class MortarMayhem(MemoryGymVectorEnv):
         s.clue_at[lane] = -1
         self._clues_open = True
 
-    def observe(self, lanes: np.ndarray | slice) -> Any:
-        """Fresh observations of the lanes."""
+    def pixels(self, lanes: np.ndarray | slice) -> Any:
+        """Fresh observations of the lanes with pixels: an act task's are a Dict."""
         if self.variant.clue:
             return self.frames(lanes)
         vector = self.state.vector[lanes]

@@ -663,7 +663,7 @@ class MysteryPath(MemoryGymVectorEnv):
     variants = VARIANTS
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
-        """The observation and the action space of one lane."""
+        """The observation space of one lane with pixels, and its action space."""
         free = not (self.variant.grid or self.variant.endless)
         actions = gym.spaces.MultiDiscrete([3, 3]) if free else gym.spaces.Discrete(4)
         return gym.spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8), actions
@@ -672,7 +672,7 @@ class MysteryPath(MemoryGymVectorEnv):
         """Makes the state of N lanes."""
         self.state = empty_state(self.num_envs, FIRST_SEGMENTS + 1 if self.variant.endless else 1)
         self.figures = (self._figure(self.defaults),)  # all that differ, of all lanes
-        self._place_tables()
+        self.place_tables()
 
     def configure(self, lanes: np.ndarray) -> None:
         """Takes over the options of the lanes, and the tables that all lanes' options need."""
@@ -693,7 +693,7 @@ class MysteryPath(MemoryGymVectorEnv):
         every = [self._figure(each) for each in self.settings]
         self.figures = tuple(dict.fromkeys(every))
         s.figure[:] = [self.figures.index(figure) for figure in every]
-        self._place_tables()
+        self.place_tables()
 
     def _place_camera(self, lanes: np.ndarray, values: dict[str, Any]) -> None:
         s, scale, speed = self.state, values["agent_scale"], int(values["agent_speed"])
@@ -711,7 +711,7 @@ class MysteryPath(MemoryGymVectorEnv):
         scale = values["agent_scale"]
         return Figure(scale, values["agent_speed"], 0, SCREEN, radius_of(scale), False)
 
-    def _place_tables(self) -> None:
+    def place_tables(self) -> None:
         """The flat tables that step() looks things up in, and where each lane's rows start in them."""
         self._wardrobe = wardrobe(self.figures)
         self._controls = grid_controls() if self.variant.grid else free_controls()
@@ -720,19 +720,11 @@ class MysteryPath(MemoryGymVectorEnv):
         self._lane_map = np.arange(self.num_envs) * self.state.step_at.shape[1] + BEYOND  # (N,)
         self._lane_path = np.arange(self.num_envs) * self.state.cell.shape[1]  # (N,)
 
-    def __getstate__(self) -> dict[str, Any]:
-        # The tables are large and follow from the options.
-        return {name: value for name, value in self.__dict__.items() if name != "_wardrobe"}
-
-    def __setstate__(self, values: dict[str, Any]) -> None:
-        self.__dict__.update(values)
-        self._place_tables()
-
     def begin(self, lane: int, rng: np.random.Generator) -> None:
         """Draws the lane's next level and starts its episode."""
         level = draw_level(rng, self.settings[lane], self.variant)
         if make_room(self.state, len(level.path), len(level.walls)):
-            self._place_tables()
+            self.place_tables()
         write_level(self.state, lane, level, self.settings[lane], self.variant)
 
     def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -800,12 +792,8 @@ class MysteryPath(MemoryGymVectorEnv):
             level = draw_segments(tape, row, segments, 1)
             tape.close()
             if make_room(s, steps + len(level.path), segments + 1):
-                self._place_tables()
+                self.place_tables()
             write_path(s, lane, level, self.variant)
-
-    def observe(self, lanes: np.ndarray | slice) -> np.ndarray:
-        """Fresh observations of the lanes."""
-        return self.frames(lanes)
 
     def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3)."""

@@ -782,9 +782,10 @@ class SearingSpotlights(MemoryGymVectorEnv):
     """
 
     variants = VARIANTS
+    tables = ("_wardrobe", "_art")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
-        """The observation and the action space of one lane."""
+        """The observation space of one lane with pixels, and its action space."""
         return gym.spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8), gym.spaces.MultiDiscrete([3, 3])
 
     def allocate(self) -> None:
@@ -793,7 +794,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         self._settle()
         self._through = False  # whether any spotlight has to be removed
         self._unlocked: list[int] = []  # lanes without coins, whose exits open in the first step
-        self._place_tables()
+        self.place_tables()
 
     def configure(self, lanes: np.ndarray) -> None:
         """Takes over the options of the lanes, and the tables that all lanes' options need."""
@@ -812,7 +813,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         s.touch[lanes, AGENT] = -1.0
         self._configure_pictures(lanes, values)
         self._settle()
-        self._place_tables()
+        self.place_tables()
 
     def _configure_pictures(self, lanes: np.ndarray, values: dict[str, Any]) -> None:
         s = self.state
@@ -840,7 +841,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         self.state.figure[:] = [2 * self.figures.index(figure) for figure in figures]
         self.state.props[:] = [3 * self.scales.index(scale) for scale in scales]
 
-    def _place_tables(self) -> None:
+    def place_tables(self) -> None:
         """The tables that step() looks things up in, and where each lane's rows start in them."""
         self._wardrobe = wardrobe(tuple(figure for pair in self.figures for figure in pair))
         radii = [values[name] for values in self.settings for name in ("spot_min_radius", "spot_max_radius")]
@@ -850,14 +851,6 @@ class SearingSpotlights(MemoryGymVectorEnv):
         self._controls = free_controls()
         self._calm = np.arange(0, 2 * self.num_envs, 2)  # (N,) the scenery's calm rows
         self._lane_walk = (self.state.figure[:, None] + np.arange(2)) * (STRIDES * SPAN)  # (N, 2)
-
-    def __getstate__(self) -> dict[str, Any]:
-        # The tables are large and follow from the options.
-        return {name: value for name, value in self.__dict__.items() if name not in ("_wardrobe", "_art")}
-
-    def __setstate__(self, values: dict[str, Any]) -> None:
-        self.__dict__.update(values)
-        self._place_tables()
 
     def begin(self, lane: int, rng: np.random.Generator) -> None:
         """Draws the lane's next level and starts its episode."""
@@ -968,10 +961,6 @@ class SearingSpotlights(MemoryGymVectorEnv):
         s.shown_gain, s.last_gain = s.last_gain, (rewards > 0) + 1
         s.returned += rewards
         return (s.length == s.limit) & ~terminated
-
-    def observe(self, lanes: np.ndarray | slice) -> np.ndarray:
-        """Fresh observations of the lanes: their frames."""
-        return self.frames(lanes)
 
     def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3)."""

@@ -12,7 +12,8 @@ from memory_gym_envs.base import ALL, RENDER_MODES
 class MemoryGymEnv(gym.Env):
     """A single environment of any id of this package; `gym.make(id)` returns it.
 
-    Arguments: the id, then those of `MemoryGymVectorEnv` but for num_envs, e.g. render_mode, num_levels, start_level.
+    Arguments: the id, then those of `MemoryGymVectorEnv` but for num_envs, e.g. render_mode, num_levels, start_level,
+    obs_type.
     Observations, actions, rewards, options and infos are those of the id, as its family's class describes them.
     """
 

@@ -1,0 +1,46 @@
+"""Vector observations: what the flat vector of an id is made of, one table row for each group of entries.
+
+A family lists an id's rows as a tuple of `Entries`, in the vector's order. The observation space and the documentation
+are made from them.
+"""
+
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Entries:
+    """Neighbouring entries of the vector that belong together.
+
+    name, width: what they are called, and how many there are.
+    low, high: what each of them lies between, both ends included.
+    """
+
+    name: str
+    width: int
+    meaning: str
+    low: float = 0.0
+    high: float = 1.0
+
+
+def vector_space(rows: tuple[Entries, ...]) -> gym.spaces.Box:
+    """The space of the vector, (V,) float32."""
+    low, high = (np.repeat([getattr(row, end) for row in rows], [row.width for row in rows]) for end in ("low", "high"))
+    return gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+
+
+def vector_slices(rows: tuple[Entries, ...]) -> dict[str, slice]:
+    """Where each row's entries are in the vector."""
+    ends = np.cumsum([row.width for row in rows]).tolist()
+    return {row.name: slice(end - row.width, end) for row, end in zip(rows, ends, strict=True)}
+
+
+def vector_table(rows: tuple[Entries, ...]) -> str:
+    """The rows as a Markdown table: place, name, range, meaning."""
+    lines = ["| entries | name | range | meaning |", "|---|---|---|---|"]
+    for row, at in zip(rows, vector_slices(rows).values(), strict=True):
+        place = f"{at.start}" if row.width == 1 else f"{at.start}-{at.stop - 1}"
+        lines.append(f"| {place} | `{row.name}` | {row.low:g} to {row.high:g} | {row.meaning} |")
+    return "\n".join(lines)
