@@ -462,6 +462,72 @@ class Heads(nn.Module):
 
 
 # ---- 5 MEMORY ----
+class GRUScan(torch.autograd.Function):
+    """One layer of `nn.GRU` over time, for training on a CPU, where the library's own is about half as fast.
+
+    Takes the projected inputs (L, S, 3D), the first states (S, D) and the recurrent weight and bias; returns the states
+    (L, S, D). What it saves: the weight is turned once instead of at every step, and its gradient is one product of
+    all steps instead of a sum of L small ones. The gates r, z and n are those of torch's documentation of nn.GRU.
+    """
+
+    @staticmethod
+    def forward(ctx, inputs: Tensor, first: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """Run the recurrence, keeping every gate for the way back."""
+        steps, (pieces, width) = len(inputs), first.shape
+        states = torch.cat([first[None], inputs.new_empty(steps, pieces, width)])  # (L + 1, S, D)
+        gates = inputs.clone()  # (L, S, 3D) the projected inputs, step by step overwritten with r, z and n
+        candidates = torch.empty_like(states[1:])  # (L, S, D) the recurrent part of n
+        turned = weight.T.contiguous()
+        for t in range(steps):
+            hidden = torch.addmm(bias, states[t], turned)  # (S, 3D)
+            rz, n = gates[t].split((2 * width, width), -1)
+            rz.add_(hidden[:, : 2 * width]).sigmoid_()
+            candidates[t] = hidden[:, 2 * width :]
+            n.addcmul_(rz[:, :width], candidates[t]).tanh_()
+            torch.lerp(n, states[t], rz[:, width:], out=states[t + 1])
+        ctx.save_for_backward(states, gates, candidates, weight)
+        return states[1:]
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Walk back through the steps: only what depends on the later states is left to the loop."""
+        states, gates, candidates, weight = ctx.saved_tensors
+        r, z, n = gates.chunk(3, -1)  # (L, S, D) each
+        to_n = (1 - z) * (1 - n.square())  # what a state's gradient is multiplied with on its way to n's argument
+        to_z = (states[:-1] - n) * z * (1 - z)
+        to_r = candidates * r * (1 - r)  # from n's argument on
+        grad_hidden = torch.empty_like(gates)  # (L, S, 3D) of the recurrent product
+        grad_n = torch.empty_like(n)
+        carried = torch.zeros_like(states[0])  # (S, D) the gradient that the later steps send back
+        for t in reversed(range(len(grad))):
+            carried += grad[t]
+            part_r, part_z, part_n = grad_hidden[t].chunk(3, -1)
+            torch.mul(carried, to_n[t], out=grad_n[t])
+            torch.mul(grad_n[t], to_r[t], out=part_r)
+            torch.mul(carried, to_z[t], out=part_z)
+            torch.mul(grad_n[t], r[t], out=part_n)
+            carried = torch.addmm(carried.mul_(z[t]), grad_hidden[t], weight)
+        grad_weight = grad_hidden.flatten(0, 1).T @ states[:-1].flatten(0, 1)  # (3D, D)
+        grad_bias = grad_hidden.sum((0, 1))
+        grad_hidden.chunk(3, -1)[2].copy_(grad_n)  # the inputs' gradient differs in n alone
+        return grad_hidden, carried, grad_weight, grad_bias
+
+
+class GRU(nn.GRU):
+    """`nn.GRU` with the batch first; learns with `GRUScan` on a CPU, with the library's kernels everywhere else."""
+
+    def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Map x (S, L, D) and the layers' first states (P, S, D) to the last layer's states and all last ones."""
+        if x.device.type != "cpu" or not torch.is_grad_enabled():
+            return super().forward(x, state)
+        x, last = x.transpose(0, 1), []  # (L, S, D)
+        for first, (w_input, w_hidden, b_input, b_hidden) in zip(state, self.all_weights, strict=True):
+            x = GRUScan.apply(F.linear(x, w_input, b_input), first, w_hidden, b_hidden)
+            last.append(x[-1])
+        return x.transpose(0, 1), torch.stack(last)
+
+
 class Memory(nn.Module):
     """A stack of GRU or LSTM layers, or nothing (thesis 5.2).
 
@@ -477,7 +543,7 @@ class Memory(nn.Module):
         self.kind = args.memory
         self.hidden_vectors = args.num_layers * {"gru": 1, "lstm": 2, "none": 0}[args.memory]
         if args.memory != "none":
-            rnn = nn.GRU if args.memory == "gru" else nn.LSTM
+            rnn = GRU if args.memory == "gru" else nn.LSTM
             # The outputs are activated already: another ReLU behind them would throw half of them away (5.2.4).
             self.rnn = layer_init(rnn(self.width, self.width, args.num_layers, batch_first=True), 1.0)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
+from torch import nn
 
 import ppo_gru
 
@@ -202,3 +203,21 @@ def test_autoreset_is_in_the_same_step():
         envs = ppo_gru.make_envs(env_id, 2, 10, 0, False)
         assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
         envs.close()
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_the_gru_learns_as_the_library_s(layers):
+    ours, library = (of(5, 5, layers, batch_first=True).double() for of in (ppo_gru.GRU, nn.GRU))
+    ours.load_state_dict(library.state_dict())
+    found = []
+    for gru in (ours, library):
+        generator = torch.Generator().manual_seed(3)
+        x, state, *wanted = (
+            torch.randn(shape, dtype=torch.float64, generator=generator, requires_grad=True)
+            for shape in ((4, 9, 5), (layers, 4, 5), (4, 9, 5), (layers, 4, 5))
+        )
+        outputs = gru(x, state)
+        sum((got * want).sum() for got, want in zip(outputs, wanted, strict=True)).backward()
+        found.append([*outputs, x.grad, state.grad, *(parameter.grad for parameter in gru.parameters())])
+    for got, want in zip(*found, strict=True):
+        torch.testing.assert_close(got, want, rtol=0, atol=1e-12)
