@@ -27,7 +27,7 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
-from typing import Literal
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -555,6 +555,14 @@ class Memory(nn.Module):
         """Return room (T, N, P, D) for what a rollout stores."""
         return torch.zeros(num_steps, lanes, self.hidden_vectors, self.width, device=device)
 
+    def store(self, stored: Tensor, t: int, item: Tensor) -> None:
+        """Put away what step t of the rollout has to be remembered for."""
+        stored[t] = item
+
+    def refresh(self, live: Tensor, stored: Tensor) -> Tensor:
+        """Make the live memory ready for a new rollout: a hidden state simply goes on."""
+        return live
+
     def step(self, x: Tensor, live: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Take one step of all lanes: x (N, D) to (N, D), the new live memory, and what to store of this step."""
         y, new_live = self.recur(x[:, None], live)
@@ -597,9 +605,9 @@ class Memory(nn.Module):
             state = torch.cat(state)
         return y, state.transpose(0, 1)
 
-    def padding_fraction(self, pieces: Pieces) -> float:
-        """Return the share of the padded (S, L) that is padding."""
-        return 1 - float(pieces.length.float().mean() / pieces.length.max())
+    def numbers(self, pieces: Pieces, stored: Tensor) -> dict[str, float]:
+        """Return what to log of a minibatch: the share of the padded (S, L) that is padding."""
+        return {"padding_fraction": 1 - float(pieces.length.float().mean() / pieces.length.max())}
 
 
 # ---- 6 AGENT ----
@@ -615,12 +623,12 @@ class Agent(nn.Module):
         self.encoder = Encoder(observation_spaces(observation_space), self.memory.width)
         self.heads = Heads(self.memory.width, action_branches(action_space))
 
-    def act(self, obs: dict[str, Tensor], live: Tensor) -> tuple[list[Categorical], Tensor, Tensor, Tensor]:
+    def act(self, obs: dict[str, Tensor], live: Any) -> tuple[list[Categorical], Tensor, Any, Any]:
         """Take one step of all lanes: the action distributions, values (N,), new live memory, and what to store."""
         x, live, stored = self.memory.step(self.encoder(obs), live)
         return *self.heads(x), live, stored
 
-    def evaluate(self, obs: dict[str, Tensor], pieces: Pieces, stored: Tensor) -> tuple[list[Categorical], Tensor]:
+    def evaluate(self, obs: dict[str, Tensor], pieces: Pieces, stored: Any) -> tuple[list[Categorical], Tensor]:
         """Recompute the action distributions and values (R,) of the steps of the pieces, in the pieces' order."""
         return self.heads(self.memory.unroll(self.encoder(obs), pieces, stored))
 
@@ -673,7 +681,7 @@ class Rollout:
     terminated: Tensor  # (T, N) the step ended its episode
     truncated: Tensor  # (T, N) the step ended its episode by a time limit
     truncation_values: Tensor  # (T, N) value of the final observation, where bootstrapped
-    memory: Tensor  # (T, N, ...) what the memory stores of each step
+    memory: Any  # what the memory stores of the steps
 
 
 def make_rollout(agent: Agent, obs: dict[str, Tensor], num_steps: int, device: torch.device) -> Rollout:
@@ -702,7 +710,7 @@ class Play:
     """Where the lanes are between two rollouts."""
 
     obs: dict[str, Tensor]  # (N, ...) the observations to act on next
-    live: Tensor  # the live memory
+    live: Any  # the live memory
     returns: np.ndarray  # (N,) undiscounted return of each lane's episode so far
     lengths: np.ndarray  # (N,) steps of each lane's episode so far
 
@@ -718,11 +726,13 @@ def collect(
     """
     device, episodes = rollout.values.device, defaultdict(list)
     rollout.truncation_values.zero_()
+    play.live = agent.memory.refresh(play.live, rollout.memory)
     for t in range(args.num_steps):
         for name, part in play.obs.items():
             rollout.obs[name][t] = part  # the first and only copy: env to device, dtype kept
         obs = {name: part[t] for name, part in rollout.obs.items()}
-        policy, rollout.values[t], live, rollout.memory[t] = agent.act(obs, play.live)
+        policy, rollout.values[t], live, stored = agent.act(obs, play.live)
+        agent.memory.store(rollout.memory, t, stored)
         actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
         rollout.actions[t], rollout.log_probs[t] = actions, log_probs_of(policy, actions)
         if recorder is not None:
@@ -831,7 +841,7 @@ def update(
     )
     returns = advantages + rollout.values
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
-    logs, padding = [], []
+    logs, numbers = [], []
     for _ in range(args.update_epochs):
         for minibatch in pieces.minibatches(args.num_minibatches):
             loss, log = minibatch_loss(agent, rollout, (advantages, returns), minibatch, ent_coef, args)
@@ -840,7 +850,7 @@ def update(
             log["losses/grad_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
             optimizer.step()
             logs.append(log)
-            padding.append(agent.memory.padding_fraction(minibatch))
+            numbers.append(agent.memory.numbers(minibatch, rollout.memory))
         epoch_kl = torch.stack([log["losses/approx_kl"] for log in logs[-args.num_minibatches :]]).mean()
         if args.target_kl is not None and epoch_kl > args.target_kl:
             break
@@ -848,8 +858,7 @@ def update(
     # Before the first gradient step the weights are the rollout's, and so must be every probability.
     means["losses/ratio_error"] = logs[0]["losses/ratio_error"].item()
     means["losses/explained_variance"] = explained_variance(rollout.values, returns)
-    means["charts/padding_fraction"] = float(np.mean(padding))
-    return means
+    return means | {f"charts/{name}": float(np.mean([each[name] for each in numbers])) for name in numbers[0]}
 
 
 def explained_variance(values: Tensor, returns: Tensor) -> float:
