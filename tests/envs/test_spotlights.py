@@ -232,7 +232,6 @@ def test_spotlight_behind_a_removed_one_pauses():
     env.step([0, 0])
     s = env.batch.state
     s.spots[TIME, 0, :4] = [1.0, 0.25, 1.0, 0.5]
-    env.batch._through = True
     env.step([0, 0])
     # The second skips a step behind the first, and the fourth behind the third.
     assert s.count[0] == 2
