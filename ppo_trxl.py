@@ -658,17 +658,15 @@ class Memory(nn.Module):
         """
         for rows in (stored.items, stored.steps):
             rows[: self.window] = rows[self.num_steps :].clone()  # overlaps itself if the window is the longer
-        age = self.window - torch.arange(self.window, device=live.steps.device)[:, None]  # (W, 1)
-        seen = visible(age, live.steps, self.window)  # (W, N)
-        items = stored.items[: self.window].masked_fill(~seen[..., None, None], 0.0)  # (W, N, K, D)
-        position = self.position(stored.steps[: self.window].where(seen, 0), items.dtype)  # (W, N, D)
+        live = Live(self.window, live.steps, live.keys, live.values)
+        rows, _, seen = self.look_back(live)
+        seen = seen[:, 0].T  # (M, N)
+        items = stored.items[rows].masked_fill(~seen[..., None, None], 0.0)  # (M, N, K, D)
+        position = self.position(stored.steps[rows].where(seen, 0), items.dtype)  # (M, N, D)
         for k, block in enumerate(self.blocks):
             keys, values = block.keys_values(items[:, :, k] + position)
-            live.keys[k, :, : self.window], live.values[k, :, : self.window] = (
-                keys.transpose(0, 1),
-                values.transpose(0, 1),
-            )
-        return Live(self.window, live.steps, live.keys, live.values)
+            live.keys[k][:, rows], live.values[k][:, rows] = keys.transpose(0, 1), values.transpose(0, 1)
+        return live
 
     def step(self, x: Tensor, live: Live) -> tuple[Tensor, Live, tuple[Tensor, Tensor]]:
         """Take one step of all lanes: x (N, D) to (N, D), the new live memory, and what to store of this step.
@@ -711,7 +709,8 @@ class Memory(nn.Module):
         """Forget the lanes whose episode ended, where done (N,) is true."""
         rows, _, _ = self.look_back(live)
         for cache in (live.keys, live.values):
-            cache[:, done, rows] = 0.0  # nothing sees them any more; not even a NaN can pass through a zero weight now
+            # Nothing sees these any more. As zeros, not even a NaN among them could pass through a weight of zero.
+            cache[:, done.nonzero()[:, 0], rows] = 0.0
         return Live(live.now, live.steps.masked_fill(done, 0), live.keys, live.values)
 
     def cut(self, done: Tensor) -> Pieces:
