@@ -47,7 +47,11 @@ class Option:
         """The allowed values in words."""
         if self.kind == "bool":
             return "true or false"
-        noun = {"int": "an integer", "float": "a number", "ints": f"a list of {self._shortest} to {LONGEST_LIST} integers"}
+        noun = {
+            "int": "an integer",
+            "float": "a number",
+            "ints": f"a list of {self._shortest} to {LONGEST_LIST} integers",
+        }
         text = "{} from {} to {}".format(noun[self.kind], *self.bounds)
         return " or ".join([*(str(value) for value in self.also), text])
 
