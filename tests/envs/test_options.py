@@ -6,7 +6,7 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import EACH, HASTY, LANES, make, roll
+from helpers import EACH, HASTY, LANES, check_same, make, roll
 from players import FAMILY
 
 from memory_gym_envs import IDS, MortarMayhem, MysteryPath, SearingSpotlights, options_table
@@ -146,6 +146,14 @@ def test_wrong_option_changes_nothing(env_id, options, message):
 def test_options_of_one_id_alone(env_id, options):
     with pytest.raises(ValueError, match=next(iter(options))):
         gym.make(env_id).reset(options=options)
+
+
+@EACH
+def test_values_may_be_numpys(env_id):
+    """The settings are plain Python all the same."""
+    numpys, envs = {"bool": np.bool_, "int": np.int64, "float": np.float64, "ints": np.array}, make(env_id)
+    given = {option.name: numpys[option.kind](option.default) for option in envs.variant.options}
+    check_same(envs.resolve(given), envs.defaults)
 
 
 @EACH
