@@ -176,7 +176,7 @@ class MemoryGymVectorEnv(VectorEnv):
             infos = self._final_info(ended, observations)
             for lane in ended.tolist():
                 self._next_level(lane, None)
-            _overwrite(observations, ended, self.observe(ended))
+            overwrite(observations, ended, self.observe(ended))
         infos.update(self._truth_info(None))
         return observations, rewards, terminated, truncated, infos
 
@@ -297,7 +297,7 @@ class MemoryGymVectorEnv(VectorEnv):
         mask[ended] = True
         final_obs = np.full(self.num_envs, None, object)
         for lane in ended.tolist():
-            final_obs[lane] = _one(observations, lane)
+            final_obs[lane] = one_of(observations, lane)
         truth = self.ground_truth()
         truth[~mask] = 0.0
         final_info: dict[str, np.ndarray] = {}
@@ -339,14 +339,14 @@ def _array(value: Any) -> np.ndarray:
         return np.asarray(None)
 
 
-def _one(observations: Any, lane: int) -> Any:
+def one_of(observations: Any, lane: int) -> Any:
     """A copy of the lane's observation."""
     if isinstance(observations, dict):
         return {key: values[lane].copy() for key, values in observations.items()}
     return observations[lane].copy()
 
 
-def _overwrite(observations: Any, lanes: np.ndarray, fresh: Any) -> None:
+def overwrite(observations: Any, lanes: np.ndarray, fresh: Any) -> None:
     """Replaces the lanes' observations, in place."""
     if isinstance(observations, dict):
         for key, values in observations.items():

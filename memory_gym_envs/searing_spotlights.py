@@ -690,6 +690,15 @@ def darken(
 # ---- rules ----
 
 
+def spot_places(spots: np.ndarray) -> np.ndarray:
+    """Where spotlights (11, N, S) are on their ways, x and y in pixels: (2, N, S) float64."""
+    place = spots[TIME] * spots[BEND]
+    place += spots[TOWARD]
+    place *= spots[TIME]
+    place += spots[START]
+    return place
+
+
 def retire(s: State) -> tuple[np.ndarray, np.ndarray]:
     """Removes the spotlights that are through: lanes and slots, each (n,), of those that pause for this step.
 
@@ -794,7 +803,6 @@ class SearingSpotlights(MemoryGymVectorEnv):
         """Makes the state of N lanes."""
         self.state = empty_state(self.num_envs)
         self._settle()
-        self._through = False  # whether any spotlight has to be removed
         self._unlocked: list[int] = []  # lanes without coins, whose exits open in the first step
         self.place_tables()
 
@@ -913,12 +921,9 @@ class SearingSpotlights(MemoryGymVectorEnv):
     def _shine(self) -> np.ndarray:
         """Moves the spotlights on; (N,) bool whose agent is in the light."""
         s = self.state
-        pausing = retire(s) if self._through else None
+        pausing = retire(s) if np.count_nonzero(s.spots[TIME] >= 1.0) else None
         time = s.spots[TIME]  # (N, S)
-        spot = time * s.spots[BEND]  # (2, N, S)
-        spot += s.spots[TOWARD]
-        spot *= time
-        spot += s.spots[START]
+        spot = spot_places(s.spots)  # (2, N, S)
         place = spot.astype(np.int64)
         place += s.spot_key
         spot -= s.bodies[:, :, :1]
@@ -930,7 +935,6 @@ class SearingSpotlights(MemoryGymVectorEnv):
             held = time[pausing]
             time += s.spots[SPEED]
             time[pausing], distance[pausing], place[(ALL, *pausing)] = held, np.inf, 0
-        self._through = np.count_nonzero(time >= 1.0) > 0
         s.place, s.seen = place, (distance <= s.spots[SIGHT]).any(axis=1)
         return (distance <= s.spots[REACH]).any(axis=1) if np.count_nonzero(s.seen) else s.seen
 

@@ -392,14 +392,15 @@ def test_debug_render_shows_the_path(env_id):
         assert frame.dtype == np.uint8
         offset = s.pos[0, 0] - s.origin[0, 0] - 60 if endless else 0
         path = path_of(s)
-        kinds = dict.fromkeys(path, WHITE) | {path[0]: BLUE} | ({} if endless else {path[-1]: GREEN})
+        kinds = {place: BLUE if place[0] % SEGMENT == SIDE else WHITE for place in path}
+        kinds |= {path[0]: BLUE} | ({} if endless else {path[-1]: GREEN})
         for segment, walls in enumerate(s.walls[0, : s.segments[0]].tolist()):
             places = [divmod(place, SIDE) for place in range(SIDE * SIDE) if walls >> place & 1]
             kinds |= {(column + SEGMENT * segment, row): RED for column, row in places}
         shown = 0
         for (column, row), color in kinds.items():
             x, y = 4 * (column * TILE - offset), 4 * row * TILE
-            seen = tuple(frame[y + 2, x + 2].tolist()) if 0 <= x < 336 else None
+            seen = tuple(frame[y + 6, x + 6].tolist()) if 0 <= x < 330 else None
             if seen in (GREEN, BLUE, RED, WHITE):  # not the agent
                 assert seen == color
                 shown += 1
