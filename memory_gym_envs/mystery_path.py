@@ -40,6 +40,7 @@ MAP_STRIDES = np.array([ROWS, 1])
 
 PIT = 0  # the step of the path at places that are none; the path's own steps count from 1, the origin
 NOWHERE = -1  # the cell of that step
+FAR = 14  # pixels: who walks further in a step can leave the stored positions
 NO_STEP = -1  # where an agent is while it is put back
 TILE_AT = (np.arange(SPAN) - PAD) // TILE  # of stored positions on the screen
 BRANCHES = np.array([3, 1])  # numbers the actions of two branches
@@ -144,7 +145,7 @@ class State:
     show_past: np.ndarray  # (N,) bool
     show_ground: np.ndarray  # (N,) bool
     show_stamina: np.ndarray  # (N,) bool
-    extras: np.ndarray  # (N,) bool: one of these, but for the past path, or a speed above PAD
+    extras: np.ndarray  # (N,) bool: one of these, but for the past path, or a speed above FAR
     feedback: np.ndarray  # (N,) bool
     camera: np.ndarray  # (N,) float64: pixels between the screen's left edge and the path's, when the agent is there
     depth: np.ndarray  # (N,) columns of the past path that are shown, and the agent's own
@@ -682,7 +683,7 @@ class MysteryPath(MemoryGymVectorEnv):
         for what, option in SHOWN.items():
             getattr(s, f"show_{what}")[lanes] = values.get(option, False)
         shown = any(values.get(option, False) for what, option in SHOWN.items() if what != "past")
-        s.extras[lanes] = shown or values.get("agent_speed", 0.0) > PAD
+        s.extras[lanes] = shown or values.get("agent_speed", 0.0) > FAR
         s.reward_goal[lanes] = values.get("reward_goal", 0.0)
         s.reward_fall_off[lanes] = values["reward_fall_off"]
         s.reward_progress[lanes] = values["reward_path_progress"]

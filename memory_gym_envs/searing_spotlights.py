@@ -35,6 +35,7 @@ MARGIN = 7  # coins and the exit stay that far from the screen's edges
 AGENT_SPACE, COIN_SPACE = 28, 21  # pixels around a place where nothing else is put
 SPOT_RADII = (1, 42)  # pixels; the largest light is as wide as the screen
 MOST_COINS = 20
+MOST_SPOTS = 200  # slow spotlights stay for ever, so others may come ever faster than they leave
 
 AGENT, EXIT, COIN = 0, 1, 2  # bodies; coins are the last ones
 GONE = 1000  # where bodies are that do not exist, in pixels
@@ -787,7 +788,8 @@ class SearingSpotlights(MemoryGymVectorEnv):
     Differences from the original: images are rows first; max_steps truncates; the finite id reports ground truth;
         nothing that an episode drew or painted black or white shows in the next; no exit, no coins and a hidden action
         bar work; coins for which no free pixel is left are put anywhere; a smallest radius or speed above the largest
-        replaces it; `coin_enabled` is new; wrong options raise ValueError.
+        replaces it; at most MOST_SPOTS spotlights shine at once, and no further one comes until one is gone;
+        `coin_enabled` is new; wrong options raise ValueError.
     """
 
     variants = VARIANTS
@@ -814,7 +816,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         s.coin_limit[lanes] = _limit(values["steps_per_coin"] if endless and values["coin_enabled"] else -1)
         s.coin_show[lanes] = NO_LIMIT if values["coins_visible"] else _limit(values.get("coin_show_duration", 0))
         waits = ("spawn_interval",) if endless else ("initial_spawn_interval", "spawn_interval_threshold")
-        s.interval[lanes] = max(1, _limit(sum(values[name] for name in waits)))
+        s.interval[lanes] = max(1, sum(values[name] for name in waits))
         radius = radius_of(values["agent_scale"])
         coin, exit_ = int(10 * values["coin_scale"]), 10 * values.get("exit_scale", 0.0)
         s.touch[lanes, COIN:], s.touch[lanes, EXIT] = (coin + radius) ** 2, (exit_ + radius) ** 2
@@ -908,9 +910,10 @@ class SearingSpotlights(MemoryGymVectorEnv):
         np.subtract(s.pos.T, PAD, out=s.bodies[:, :, AGENT])
 
     def _spawn(self, lane: int) -> None:
-        """Adds a spotlight to the lane's."""
+        """Adds a spotlight to the lane's, if there is room."""
         s = self.state
-        add_spot(s, lane, draw_spot(self._rngs[lane], self.settings[lane]))
+        if s.count[lane] < MOST_SPOTS:
+            add_spot(s, lane, draw_spot(self._rngs[lane], self.settings[lane]))
         s.spawns[lane] -= 1
         # Always the first interval of the original's list, as its spawns remove the last one.
         s.wait[lane] = s.interval[lane] if s.spawns[lane] else NO_LIMIT
@@ -1016,7 +1019,7 @@ RULES = {
 
 
 def _limit(steps: int) -> int:
-    return NO_LIMIT if steps == -1 else min(steps, NO_LIMIT)
+    return NO_LIMIT if steps == -1 else steps
 
 
 def _fading(duration: int, threshold: int) -> np.ndarray:

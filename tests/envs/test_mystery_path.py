@@ -8,6 +8,7 @@ import pytest
 from players import player, stumbling, turn_or_walk
 
 from memory_gym_envs import MysteryPath
+from memory_gym_envs.character import BODY, PAD
 from memory_gym_envs.mystery_path import (
     AGAIN,
     BEYOND,
@@ -211,6 +212,17 @@ def test_large_agents_start_beside_the_origin(scale):
     beside = int(25 * scale) // TILE
     assert s.tile[0].tolist() == [column + beside, row + beside]
     assert env.batch.reset(options={"agent_scale": scale})[0] in env.batch.observation_space
+
+
+@pytest.mark.parametrize("speed", [14, 15, 16, 17, 84])
+def test_the_largest_agent_leaves_the_screen_at_any_speed(speed):
+    env, s = made(ENDLESS, 7, agent_scale=1.0, agent_speed=speed)
+    assert path_of(s)[0] == (0, SIDE - 1)  # the bottom row, from which the agent walks down
+    frame, *_ = env.step(3)
+    assert s.pos[0, 1] == (SIDE - 1) * TILE + 25 + speed + PAD
+    assert not has(frame, BODY)
+    frame, *_ = env.step(3)
+    assert has(frame, BODY)
 
 
 # ---- endless episodes ----
