@@ -309,6 +309,12 @@ class MemoryGymVectorEnv(VectorEnv):
         return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask.copy()}
 
 
+def numbered(every: list[Any]) -> tuple[tuple[Any, ...], list[int]]:
+    """The different ones among these, and for each which of them it is."""
+    different = tuple(dict.fromkeys(every))
+    return different, [different.index(each) for each in every]
+
+
 def widened(array: np.ndarray, width: int) -> np.ndarray:
     """The same rows with room for at least `width` columns."""
     missing = width - array.shape[1]

@@ -4,13 +4,13 @@ Shape letters: N lanes, n some of them, C commands that fit, L steps that the lo
 """
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import ALL, DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, widened
+from memory_gym_envs.base import ALL, DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, numbered, widened
 from memory_gym_envs.character import (
     FACINGS,
     PAD,
@@ -20,10 +20,13 @@ from memory_gym_envs.character import (
     free_controls,
     grid_controls,
     radius_of,
+    sprites,
     walk,
     wardrobe,
 )
 from memory_gym_envs.drawing import ROW, SCREEN, Sheet, paste, ring, turned_45
+from memory_gym_envs.entries import Entries, vector_slices
+from memory_gym_envs.looks import LARGEST, Looks, View, agent_entries, covered, look, make_looks
 from memory_gym_envs.options import Option
 
 TILE = 14  # pixels
@@ -55,6 +58,7 @@ class Variant:
     jitter: bool  # the agent starts up to two pixels off its tile's centre
     render_fps: int
     options: tuple[Option, ...]
+    entries: tuple[Entries, ...]  # of a vector observation
 
 
 def _options(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
@@ -81,9 +85,23 @@ def _options(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
     return tuple(option for present, option in rows if present)
 
 
+def _entries(clue: bool, endless: bool) -> tuple[Entries, ...]:
+    """What a vector observation of an id is made of."""
+    command = f"the command that is shown, one-hot: {', '.join(COMMANDS)}; zeros: none"
+    rest = f"the commands, as in vector_observation: {VECTOR_COMMANDS} by 9 one-hot, {', '.join(VECTOR_ORDER)}"
+    around = LARGEST // 2 + 1 if endless else 0  # how far beyond the screen's edge an agent may be
+    return (
+        *agent_entries(-around, SCREEN + around),
+        Entries("arena", 1, f"tiles along one side of the arena, / {SIZES[-1]}; 0: an agent hides all of it"),
+        Entries("fire", 1, "1: tiles burn, and it shows"),
+        Entries("safe", 2, "the centre of the tile that does not burn, x and y, / 84 pixels; zeros: none, or hidden"),
+        Entries("command", len(COMMANDS), command) if clue else Entries("commands", VECTOR_COMMANDS * 9, rest),
+    )
+
+
 def _variant(fps: int, grid: bool = False, clue: bool = True, endless: bool = False) -> Variant:
     jitter = endless or not (clue or grid)
-    return Variant(grid, clue, endless, jitter, fps, _options(grid, clue, endless))
+    return Variant(grid, clue, endless, jitter, fps, _options(grid, clue, endless), _entries(clue, endless))
 
 
 VARIANTS = {
@@ -322,6 +340,67 @@ def draw(s: State, sheet: Sheet, lanes: np.ndarray | slice) -> np.ndarray:
     return frames.reshape(-1, SCREEN, SCREEN, 3)
 
 
+# ---- vector observations ----
+
+COMMAND_ENTRIES = np.eye(1 + len(COMMANDS), dtype=np.float32)[:, 1:]  # for every symbol; BLANK: zeros
+CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # (4, 2)
+
+
+@cache
+def floor_entries() -> np.ndarray:
+    """(F, 4) float32, read-only: arena, fire and safe tile, for every row of floors()."""
+    rows = []
+    for size in SIZES:
+        first = SCREEN // 2 - TILE * size // 2 + TILE // 2
+        rows.append((size / SIZES[-1], 0, 0, 0))
+        for x in range(size):
+            rows += [
+                (size / SIZES[-1], 1, (first + TILE * x) / SCREEN, (first + TILE * y) / SCREEN) for y in range(size)
+            ]
+    table = np.array(rows, np.float32)
+    table.flags.writeable = False
+    return table
+
+
+@cache
+def symbol_masks() -> np.ndarray:
+    """(10, SCREEN, SCREEN) bool: where each symbol is drawn."""
+    masks = np.zeros((len(symbols()), SCREEN, SCREEN), bool)
+    square = slice(SYMBOL_AT, SYMBOL_AT + SYMBOL)
+    masks[:, square, square] = symbols()[:, :, ::3] > 0
+    return masks
+
+
+@lru_cache(maxsize=16)
+def looks(figures: tuple[Figure, ...], clue: bool) -> Looks:
+    """What can be seen of these figures behind every symbol, where symbols are shown."""
+    views = []
+    for figure in figures:
+        around = (figure.reach + 1) // 2 if figure.torus else 0
+        reach = range(PAD - around, PAD + SCREEN + around + 1)
+        image, solid = sprites(figure.scale)
+        free = ~symbol_masks() if clue else ~symbol_masks()[:1]
+        views += [View(figure.scale, image, solid, each, reach, reach) for each in free]
+    return make_looks(views)
+
+
+def hide_floor(out: np.ndarray, s: State, lanes: np.ndarray | slice, sprite: np.ndarray, looks: Looks) -> None:
+    """Clears the floor's entries (n, 4) of what large agents hide, in place.
+
+    What shows is decided by some pixels alone, which no two floors have in common: the arena's corners and the tile's.
+    """
+    first, size = SCREEN // 2 - TILE * s.size[lanes] // 2 + PAD, s.size[lanes]
+    arena = first[:, None, None] + CORNERS * (TILE * size - 1)[:, None, None]  # (n, 4, 2)
+    tile = s.goal[lanes][:, None] + CORNERS * (TILE - 1)  # (n, 4, 2)
+    points = np.concatenate([arena, tile], axis=1)  # (n, 8, 2)
+    x, y = np.moveaxis(points - PAD, -1, 0)
+    shown = ~covered(looks, sprite, s.pos[lanes], points) & ~symbol_masks()[s.symbol[lanes][:, None], y, x]  # (n, 8)
+    burning = shown[:, :4] & (arena != tile).any(axis=-1)
+    out[:, 0] *= shown[:, :4].any(axis=1)
+    out[:, 1:] *= burning.any(axis=1)[:, None]
+    out[:, 2:] *= shown[:, 4:].any(axis=1)[:, None]
+
+
 # ---- rules ----
 
 
@@ -411,6 +490,7 @@ class MortarMayhem(MemoryGymVectorEnv):
     """
 
     variants = VARIANTS
+    tables = (*MemoryGymVectorEnv.tables, "_looks")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
         """The observation space of one lane with pixels, and its action space."""
@@ -442,9 +522,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         if variant.clue:
             period = max(values["command_show_duration"]) + max(values["command_show_delay"])
             s.clue = widened(s.clue, count * period + 1)
-        every = [self._figure(each) for each in self.settings]
-        self.figures = tuple(dict.fromkeys(every))
-        s.figure[:] = [self.figures.index(figure) for figure in every]
+        self.figures, s.figure[:] = numbered([self._figure(each) for each in self.settings])
         self.place_tables()
 
     def _figure(self, values: dict[str, Any]) -> Figure:
@@ -461,6 +539,11 @@ class MortarMayhem(MemoryGymVectorEnv):
         self._controls = grid_controls() if self.variant.grid else free_controls()
         self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
         self._lane_clue = np.arange(self.num_envs) * self.state.clue.shape[1]  # (N,)
+        if self.obs_type == "vector":
+            self._looks = looks(self.figures, self.variant.clue)
+            self._at = vector_slices(self.variant.entries)
+            # An agent that is no wider than a tile cannot hide one.
+            self._large = any(2 * figure.reach > TILE for figure in self.figures)
 
     def begin(self, lane: int, rng: np.random.Generator) -> None:
         """Draws the lane's next level and starts its episode."""
@@ -541,6 +624,24 @@ class MortarMayhem(MemoryGymVectorEnv):
             return self.frames(lanes)
         vector = self.state.vector[lanes]
         return {"visual_observation": self.frames(lanes), "vector_observation": vector.copy()}
+
+    def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh vector observations of the lanes, (n, V) float32."""
+        s, at, clue = self.state, self._at, self.variant.clue
+        symbol = s.symbol[lanes]
+        view = s.figure[lanes] * len(symbols()) + symbol if clue else s.figure[lanes]
+        sprite = view * FACINGS + s.facing[lanes]  # (n,)
+        out = np.empty((len(symbol), *self.single_observation_space.shape), np.float32)
+        look(out[:, at["size"].start : at["facing"].stop], self._looks, sprite, s.pos[lanes])
+        floor = out[:, at["arena"].start : at["safe"].stop]
+        floor[:] = floor_entries().take(s.floor[lanes], axis=0)
+        if self._large:
+            hide_floor(floor, s, lanes, sprite, self._looks)
+        if clue:
+            out[:, at["command"]] = COMMAND_ENTRIES.take(symbol, axis=0)
+        else:
+            out[:, at["commands"]] = s.vector[lanes]
+        return out
 
     def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3)."""

@@ -5,13 +5,13 @@ Shape letters: N lanes, n some of them, M cells of the map, P steps of the path 
 
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, widened
+from memory_gym_envs.base import DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, numbered, widened
 from memory_gym_envs.character import (
     FACINGS,
     PAD,
@@ -21,10 +21,13 @@ from memory_gym_envs.character import (
     free_controls,
     grid_controls,
     radius_of,
+    sprites,
     walk,
     wardrobe,
 )
 from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, magnify, make_sheet, paste, stamp
+from memory_gym_envs.entries import Entries, vector_slices
+from memory_gym_envs.looks import LARGEST, Looks, View, agent_entries, covered, look, make_looks
 from memory_gym_envs.options import Option
 
 TILE = 12  # pixels
@@ -61,6 +64,7 @@ class Variant:
     endless: bool  # a path without a goal, from left to right; no walking left, and stamina
     render_fps: int
     options: tuple[Option, ...]
+    entries: tuple[Entries, ...]  # of a vector observation
 
 
 def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
@@ -91,8 +95,32 @@ def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
     return tuple(option for present, option in rows if present)
 
 
+def _entries(endless: bool) -> tuple[Entries, ...]:
+    """What a vector observation of an id is made of."""
+    cross = Entries("cross", 1, "1: a red cross shows that the agent fell off")
+    if not endless:
+        places = [
+            Entries(name, 2, f"the centre of the path's {name}, x and y, / 84 pixels; zeros: not shown, or hidden")
+            for name in ("origin", "goal")
+        ]
+        return *agent_entries(0, SCREEN + LARGEST), cross, *places
+    past = (
+        "1: a tile of the path behind the agent shows, by column and then row; its left edge is in one of 8 columns of "
+        "12 pixels, the first of which is left of the screen"
+    )
+    return (
+        *agent_entries(-PAD, SPAN - 1 - PAD),
+        cross,
+        Entries("past", SEGMENT * SIDE, past),
+        Entries("scroll", 1, "how far right of its column's left edge such a tile starts, / 12 pixels"),
+        Entries("ground", 1, "how far left the background has moved and 1, / 12 pixels; 0: there is none"),
+        Entries("bar", 1, "1: the stamina bar is there"),
+        Entries("stamina", 1, "how much of it is green"),
+    )
+
+
 def _variant(fps: int, grid: bool = False, endless: bool = False) -> Variant:
-    return Variant(grid, endless, fps, _options(grid, endless))
+    return Variant(grid, endless, fps, _options(grid, endless), _entries(endless))
 
 
 VARIANTS = {
@@ -112,6 +140,7 @@ class State:
     pos: np.ndarray  # (N, 2) the agent's centre, x and y; in the endless id x is counted along the path
     facing: np.ndarray  # (N,)
     figure: np.ndarray  # (N,) which of the batch's figures the agent is
+    scene: np.ndarray  # (N,) and which of its scenes it is in
     origin: np.ndarray  # (N, 2) where the agent starts and is put back to
     tile: np.ndarray  # (N, 2) the agent's tile, column and row
     step: np.ndarray  # (N,) the path's step at that tile, or PIT
@@ -433,13 +462,17 @@ def tiles() -> Sheet:
     return make_sheet(pictures, np.ones(pictures.shape[:3], bool), np.arange(SPAN) - PAD)
 
 
+def cross_mask() -> np.ndarray:
+    """(CROSS, CROSS) bool: two diagonals, three pixels wide."""
+    rows, columns = np.indices((CROSS, CROSS))
+    return (abs(rows - columns) <= 1) | (abs(rows + columns - CROSS + 1) <= 1)
+
+
 @cache
 def crosses() -> Sheet:
-    """The red cross: two diagonals, three pixels wide."""
-    rows, columns = np.indices((CROSS, CROSS))
-    mask = (abs(rows - columns) <= 1) | (abs(rows + columns - CROSS + 1) <= 1)
+    """The red cross."""
     picture = np.tile(np.array(RED, np.uint8), (CROSS, CROSS, 1))
-    return make_sheet(picture[None], mask[None], np.arange(SPAN) - PAD)
+    return make_sheet(picture[None], cross_mask()[None], np.arange(SPAN) - PAD)
 
 
 @cache
@@ -491,9 +524,7 @@ def tile_centres(cell: np.ndarray) -> np.ndarray:
 def draw_endless_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     """(n, FRAME): black or the background, and the path behind the agent where it is shown."""
     if np.count_nonzero(s.extras[lanes]):
-        # Starts again as soon as it has moved by a tile or more, which jumps if the speed does not divide that.
-        walked = s.pos[lanes, 0] - s.origin[lanes, 0]
-        frames = grounds().take((walked % s.lap[lanes] + 1) * s.show_ground[lanes], axis=0)
+        frames = grounds().take(ground_rows(s, lanes), axis=0)
     else:
         frames = np.zeros((len(s.at[lanes]), FRAME), np.uint8)
     if np.count_nonzero(s.past[lanes]):
@@ -501,18 +532,16 @@ def draw_endless_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     return frames
 
 
+def ground_rows(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+    """(n,) the rows of grounds() that are behind everything."""
+    # Starts again as soon as it has moved by a tile or more, which jumps if the speed does not divide that.
+    walked = s.pos[lanes, 0] - s.origin[lanes, 0]
+    return (walked % s.lap[lanes] + 1) * s.show_ground[lanes]
+
+
 def draw_trail(frames: np.ndarray, s: State, lanes: np.ndarray | slice) -> None:
     """Draws the past path on the lanes' frames, in place."""
-    lane, y = s.trail_lane, s.trail_y  # (m,)
-    # A camera between two pixels cuts the fraction off, towards zero.
-    x = (s.trail_x - (s.pos[:, 0] - s.origin[:, 0] - s.camera)[lane]).astype(np.int64)
-    if isinstance(lanes, slice):
-        owner = lane
-    else:
-        frame = np.full(len(s.at), NOWHERE)
-        frame[lanes] = np.arange(len(lanes))
-        mine = frame[lane] != NOWHERE
-        owner, x, y = frame[lane[mine]], x[mine], y[mine]
+    owner, x, y = trail_on_screen(s, lanes)
     whole = (x >= 0) & (x <= SCREEN - TILE)
     if np.count_nonzero(whole) < len(whole):
         cut = ~whole & (x > -TILE) & (x < SCREEN)
@@ -523,25 +552,124 @@ def draw_trail(frames: np.ndarray, s: State, lanes: np.ndarray | slice) -> None:
     stamp(frames, tile_picture(WHITE, GREY), owner, x, y)
 
 
-def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: np.ndarray | slice, endless: bool) -> None:
-    """Draws the agents, their stamina and their crosses on the frames (n, FRAME), in place."""
-    pos, extras = s.pos[lanes], endless and np.count_nonzero(s.extras[lanes])
+def trail_on_screen(s: State, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The past path of the lanes: for each tile, (m,), whose of them it is, and its first pixel, x and y."""
+    lane, y = s.trail_lane, s.trail_y  # (m,)
+    # A camera between two pixels cuts the fraction off, towards zero.
+    x = (s.trail_x - (s.pos[:, 0] - s.origin[:, 0] - s.camera)[lane]).astype(np.int64)
+    if isinstance(lanes, slice):
+        return lane, x, y
+    frame = np.full(len(s.at), NOWHERE)
+    frame[lanes] = np.arange(len(lanes))
+    owner = frame[lane]
+    mine = owner != NOWHERE
+    return owner[mine], x[mine], y[mine]
+
+
+def place_on_screen(s: State, lanes: np.ndarray | slice, endless: bool) -> np.ndarray:
+    """(n, 2) where the agents are drawn."""
+    pos = s.pos[lanes]
     if endless:
         pos = pos.copy()
         pos[:, 0] = s.figure_x[lanes]
-        if extras:  # a fast agent may be far off the screen
+        if np.count_nonzero(s.extras[lanes]):  # a fast agent may be far off the screen
             np.clip(pos, 0, SPAN - 1, out=pos)
+    return pos
+
+
+def spent_stamina(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+    """(n,) how many pixels of the bar are red."""
+    return (SCREEN * (1 - s.stamina[lanes] / s.stamina_level[lanes])).astype(np.int64)
+
+
+def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: np.ndarray | slice, endless: bool) -> None:
+    """Draws the agents, their stamina and their crosses on the frames (n, FRAME), in place."""
+    pos, extras = place_on_screen(s, lanes, endless), endless and np.count_nonzero(s.extras[lanes])
     paste(frames, sheet, s.figure[lanes] * FACINGS + s.facing[lanes], pos)
     if extras:
         shown = s.show_stamina[lanes]
-        spent = (SCREEN * (1 - s.stamina[lanes] / s.stamina_level[lanes])).astype(np.int64)  # (n,) pixels
-        frames.reshape(-1, SCREEN, ROW)[shown, :, -3 * BAR :] = bars()[spent[shown]]
+        frames.reshape(-1, SCREEN, ROW)[shown, :, -3 * BAR :] = bars()[spent_stamina(s, lanes)[shown]]
     (which,) = s.hurt[lanes].nonzero()
     if which.size:
         cross = pos[which]
         if endless:
             cross[:, 0] = s.cross_x[lanes][which]
         paste(frames, crosses(), np.zeros_like(which), cross, which)
+
+
+# ---- vector observations ----
+
+CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # (4, 2)
+
+
+class Scene(NamedTuple):
+    """What decides how much of an agent shows. Lanes whose options agree share one."""
+
+    scale: float
+    column: int | None  # the stored position where the agent is always drawn, in the endless id
+    aside: int  # how far right of the agent's centre its cross is drawn
+    width: int  # pixels of the screen that are left of the stamina bar
+
+
+@lru_cache(maxsize=16)
+def looks(scenes: tuple[Scene, ...]) -> Looks:
+    """What can be seen of the agent in these scenes, without a cross and with one."""
+    views = []
+    for scene in scenes:
+        free = np.zeros((SCREEN, SCREEN), bool)
+        free[:, : scene.width] = True
+        rows = range(SPAN) if scene.column else range(PAD, PAD + SCREEN + LARGEST + 1)
+        columns = range(scene.column, scene.column + 1) if scene.column else rows
+        image, solid = sprites(scene.scale)
+        for picture in ((image, solid), crossed(image, solid, scene.aside)):
+            views.append(View(scene.scale, *picture, free, columns, rows))
+    return make_looks(views)
+
+
+def crossed(image: np.ndarray, solid: np.ndarray, aside: int) -> tuple[np.ndarray, np.ndarray]:
+    """The figure's sprites with a cross over them, so far right of their middle."""
+    margin = max(0, CROSS // 2 + abs(aside) - solid.shape[1] // 2)
+    around = ((0, 0), (margin, margin), (margin, margin))
+    image, solid = np.pad(image, (*around, (0, 0))), np.pad(solid, around)
+    first = solid.shape[1] // 2 - CROSS // 2
+    square = (slice(None), slice(first, first + CROSS), slice(first + aside, first + aside + CROSS))
+    image[square][:, cross_mask()], solid[square][:, cross_mask()] = RED, True
+    return image, solid
+
+
+def show_ends(out: np.ndarray, s: State, lanes: np.ndarray | slice, looks: Looks, sprite: np.ndarray) -> None:
+    """Writes the path's origin and goal to out, (n, 4) and zeros so far, where they are shown and not hidden."""
+    which, last = np.arange(len(out)), s.count[lanes]
+    for end, shown, step in ((0, s.show_origin[lanes], np.ones_like(last)), (2, s.show_goal[lanes], last)):
+        centre = tile_centres(s.cell[lanes][which, step])  # (n, 2)
+        points = centre[:, None] - TILE // 2 + CORNERS * (TILE - 1)  # (n, 4, 2)
+        shown = shown & ~covered(looks, sprite, s.pos[lanes], points).all(axis=1)
+        out[:, end : end + 2] = (centre - PAD) / SCREEN * shown[:, None]
+
+
+def show_trail(out: np.ndarray, s: State, lanes: np.ndarray | slice, looks: Looks, agent: tuple | None) -> None:
+    """Writes the past path and the scroll of its tiles to out, (n, 57) and zeros so far.
+
+    agent: its sprites (n,) and where they are drawn (n, 2), if it is large enough to hide a tile.
+    """
+    owner, x, y = trail_on_screen(s, lanes)
+    # A tile shows where one of its corners does. The background has the same corners, but not the pixels inside them.
+    inset = s.show_ground[lanes][owner]  # (m,)
+    width = (SCREEN - BAR * s.show_stamina[lanes])[owner]
+    left, right = x + inset, x + TILE - 1 - inset
+    if agent is None:
+        shown = (left < width) & (right >= 0)
+    else:
+        sprite, pos = (each[owner] for each in agent)
+        points = (
+            np.stack([x, y], axis=1)[:, None] + inset[:, None, None] + CORNERS * (TILE - 1 - 2 * inset)[:, None, None]
+        )
+        free = (points[..., 0] >= 0) & (points[..., 0] < width[:, None])
+        shown = (free & ~covered(looks, sprite, pos, points + PAD)).any(axis=1)
+    owner, x, y = owner[shown], x[shown], y[shown]
+    out[owner, (x // TILE + 1) * SIDE + y // TILE] = 1.0
+    # Not all of a path's tiles have the same, where the camera is between two pixels.
+    np.maximum.at(out[:, -1], owner, (x % TILE / TILE).astype(np.float32))
 
 
 # ---- rules ----
@@ -622,6 +750,14 @@ def fall(s: State, cell: np.ndarray) -> np.ndarray:
     return over
 
 
+def camera_columns(values: dict[str, Any]) -> tuple[int, int]:
+    """Where the endless id draws the agent, and where its cross: stored positions along x."""
+    radius, camera = radius_of(values["agent_scale"]), TILE * values["camera_offset_scale"]
+    # The original cuts the fraction off at the corner of the agent's sprite, and rounds the cross's middle.
+    corner = (2 * radius + int(10 * values["agent_scale"]) + 14) // 2
+    return corner + int(radius - corner + camera) + PAD, math.floor(radius + camera + 0.5) + PAD
+
+
 class MysteryPath(MemoryGymVectorEnv):
     """Mystery Path (thesis 4.4; memory-gym 1.0.2), N lanes at once.
 
@@ -662,6 +798,7 @@ class MysteryPath(MemoryGymVectorEnv):
     """
 
     variants = VARIANTS
+    tables = (*MemoryGymVectorEnv.tables, "_looks")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
         """The observation space of one lane with pixels, and its action space."""
@@ -673,6 +810,7 @@ class MysteryPath(MemoryGymVectorEnv):
         """Makes the state of N lanes."""
         self.state = empty_state(self.num_envs, FIRST_SEGMENTS + 1 if self.variant.endless else 1)
         self.figures = (self._figure(self.defaults),)  # all that differ, of all lanes
+        self.scenes = (self._scene(self.defaults),)  # likewise
         self.place_tables()
 
     def configure(self, lanes: np.ndarray) -> None:
@@ -691,26 +829,29 @@ class MysteryPath(MemoryGymVectorEnv):
         s.stamina_level[lanes] = values.get("stamina_level", 1)
         if self.variant.endless:
             self._place_camera(lanes, values)
-        every = [self._figure(each) for each in self.settings]
-        self.figures = tuple(dict.fromkeys(every))
-        s.figure[:] = [self.figures.index(figure) for figure in every]
+        self.figures, s.figure[:] = numbered([self._figure(each) for each in self.settings])
+        self.scenes, s.scene[:] = numbered([self._scene(each) for each in self.settings])
         self.place_tables()
 
     def _place_camera(self, lanes: np.ndarray, values: dict[str, Any]) -> None:
-        s, scale, speed = self.state, values["agent_scale"], int(values["agent_speed"])
-        camera = TILE * values["camera_offset_scale"]
-        s.camera[lanes], s.depth[lanes], s.speed[lanes] = camera, int(values["camera_offset_scale"]), speed
+        s, speed = self.state, int(values["agent_speed"])
+        s.camera[lanes], s.depth[lanes] = TILE * values["camera_offset_scale"], int(values["camera_offset_scale"])
+        s.speed[lanes] = speed
         s.lap[lanes] = speed * math.ceil(TILE / speed) if speed else 1
-        # The original cuts the fraction off at the corner of the agent's sprite, and rounds the cross's middle.
-        radius, corner = radius_of(scale), (2 * radius_of(scale) + int(10 * scale) + 14) // 2
-        s.figure_x[lanes] = corner + int(radius - corner + camera) + PAD
-        s.cross_x[lanes] = math.floor(radius + camera + 0.5) + PAD
+        s.figure_x[lanes], s.cross_x[lanes] = camera_columns(values)
 
     def _figure(self, values: dict[str, Any]) -> Figure:
         if self.variant.grid:
             return Figure(0.25, TILE, 0, SCREEN, TILE // 2, False)
         scale = values["agent_scale"]
         return Figure(scale, values["agent_speed"], 0, SCREEN, radius_of(scale), False)
+
+    def _scene(self, values: dict[str, Any]) -> Scene:
+        scale = 0.25 if self.variant.grid else values["agent_scale"]
+        if not self.variant.endless:
+            return Scene(scale, None, 0, SCREEN)
+        figure_x, cross_x = camera_columns(values)
+        return Scene(scale, figure_x, cross_x - figure_x, SCREEN - BAR * values["show_stamina"])
 
     def place_tables(self) -> None:
         """The flat tables that step() looks things up in, and where each lane's rows start in them."""
@@ -720,6 +861,11 @@ class MysteryPath(MemoryGymVectorEnv):
         self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
         self._lane_map = np.arange(self.num_envs) * self.state.step_at.shape[1] + BEYOND  # (N,)
         self._lane_path = np.arange(self.num_envs) * self.state.cell.shape[1]  # (N,)
+        if self.obs_type == "vector":
+            self._looks = looks(self.scenes)
+            self._at = vector_slices(self.variant.entries)
+            # An agent that is no wider than a tile cannot hide one.
+            self._large = any(2 * radius_of(scene.scale) > TILE for scene in self.scenes)
 
     def begin(self, lane: int, rng: np.random.Generator) -> None:
         """Draws the lane's next level and starts its episode."""
@@ -795,6 +941,42 @@ class MysteryPath(MemoryGymVectorEnv):
             if make_room(s, steps + len(level.path), segments + 1):
                 self.place_tables()
             write_path(s, lane, level, self.variant)
+
+    def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh vector observations of the lanes, (n, V) float32."""
+        s, at, endless = self.state, self._at, self.variant.endless
+        pos, hurt = place_on_screen(s, lanes, endless), s.hurt[lanes]
+        sprite = (2 * s.scene[lanes] + hurt) * FACINGS + s.facing[lanes]  # (n,)
+        out = np.zeros((len(hurt), *self.single_observation_space.shape), np.float32)
+        look(out[:, at["size"].start : at["facing"].stop], self._looks, sprite, pos)
+        if endless:
+            self._show_endless(out, lanes, sprite, pos)
+        else:
+            out[:, at["cross"]] = hurt[:, None]
+            if np.count_nonzero(s.extras[lanes]):
+                show_ends(out[:, at["origin"].start : at["goal"].stop], s, lanes, self._looks, sprite)
+        return out
+
+    def _show_endless(self, out: np.ndarray, lanes: np.ndarray | slice, sprite: np.ndarray, pos: np.ndarray) -> None:
+        """Writes what only the endless id has, or has off the screen."""
+        s, at = self.state, self._at
+        hurt = s.hurt[lanes]
+        if np.count_nonzero(hurt):
+            width = SCREEN - BAR * s.show_stamina[lanes]
+            on_screen = abs(2 * (pos[:, 1] - PAD) - SCREEN) < SCREEN + CROSS
+            out[:, at["cross"].start] = hurt & on_screen & (s.cross_x[lanes] - PAD - CROSS // 2 < width)
+        if np.count_nonzero(s.past[lanes]):
+            show_trail(
+                out[:, at["past"].start : at["scroll"].stop],
+                s,
+                lanes,
+                self._looks,
+                (sprite, pos) if self._large else None,
+            )
+        if np.count_nonzero(s.extras[lanes]):
+            out[:, at["ground"].start] = ground_rows(s, lanes) / TILE
+            out[:, at["bar"].start] = s.show_stamina[lanes]
+            out[:, at["stamina"].start] = s.show_stamina[lanes] * (1 - spent_stamina(s, lanes) / SCREEN)
 
     def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3)."""

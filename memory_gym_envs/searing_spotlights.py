@@ -25,6 +25,7 @@ from memory_gym_envs.character import (
     wardrobe,
 )
 from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, disk, magnify, make_sheet, paste, ring
+from memory_gym_envs.entries import Entries
 from memory_gym_envs.options import Option
 
 TILE = 12  # pixels; the floor is a chessboard
@@ -63,6 +64,7 @@ class Variant:
     endless: bool  # one coin after the other, no exit
     render_fps: int
     options: tuple[Option, ...]
+    entries: tuple[Entries, ...] = ()  # of a vector observation
 
 
 UNUSED = "ignored, as in the original"
