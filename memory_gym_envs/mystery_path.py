@@ -442,7 +442,7 @@ WHITE, GREY, ICE = (255, 255, 255), (210, 210, 210), (125, 177, 250)
 BLUE, GREEN, RED = (0, 0, 255), (0, 255, 0), (255, 0, 0)
 CROSS = 10  # width of the cross
 BAR = 4  # width of the stamina bar
-PAST, STEP, ORIGIN, GOAL, WALL = range(5)  # rows of tiles()
+STEP, ORIGIN, GOAL, WALL = range(4)  # rows of tiles()
 BACK = np.arange(1, (2 * SIDE - 1) * SIDE + 1)  # steps back that can be drawn: those on less than two segments
 
 
@@ -458,7 +458,7 @@ def tile_picture(inner: tuple[int, int, int], border: tuple[int, int, int]) -> n
 @cache
 def tiles() -> Sheet:
     """Every kind of tile, to be pasted where a part of it may be off the screen."""
-    colors = [(WHITE, GREY), (WHITE, WHITE), (BLUE, BLUE), (GREEN, GREEN), (RED, RED)]
+    colors = [(WHITE, GREY), (BLUE, BLUE), (GREEN, GREEN), (RED, RED)]
     pictures = np.stack([tile_picture(*color) for color in colors])
     return make_sheet(pictures, np.ones(pictures.shape[:3], bool), np.arange(SPAN) - PAD)
 
@@ -548,7 +548,7 @@ def draw_trail(frames: np.ndarray, s: State, lanes: np.ndarray | slice) -> None:
         cut = ~whole & (x > -TILE) & (x < SCREEN)
         centres = np.stack([x[cut], y[cut]], axis=1) + TILE // 2 + PAD
         # Before the whole tiles, which then cover what the cut ones' squares have of them.
-        paste(frames, tiles(), np.full(len(centres), PAST), centres, owner[cut])
+        paste(frames, tiles(), np.full(len(centres), STEP), centres, owner[cut])
         owner, x, y = owner[whole], x[whole], y[whole]
     stamp(frames, tile_picture(WHITE, GREY), owner, x, y)
 
@@ -989,11 +989,12 @@ class MysteryPath(MemoryGymVectorEnv):
         return numbers | {"success": success, "num_fails": s.fails[lanes]}
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
-        """Draws the path in white, its origin blue, its goal green and the walls red, then the agent over them."""
+        """Draws the path in white, its origin and transition tiles blue, its goal green, walls red, then the agent."""
         s, one, endless = self.state, np.array([lane]), self.variant.endless
         small = draw_endless_ground(s, one) if endless else draw_ground(s, one)  # (1, FRAME)
         steps = int(s.count[lane])
-        marks = [(cell, STEP) for cell in s.cell[lane, 1 : steps + 1].tolist()]
+        path = s.cell[lane, 1 : steps + 1].tolist()
+        marks = [(cell, ORIGIN if cell // ROWS % SEGMENT == SIDE else STEP) for cell in path]
         marks[0] = (marks[0][0], ORIGIN)
         if not endless:
             marks[-1] = (marks[-1][0], GOAL)

@@ -8,6 +8,7 @@ import pytest
 from players import player, stumbling, turn_or_walk
 
 from memory_gym_envs import MysteryPath
+from memory_gym_envs.character import BODY, PAD
 from memory_gym_envs.mystery_path import (
     AGAIN,
     BEYOND,
@@ -213,6 +214,17 @@ def test_large_agents_start_beside_the_origin(scale):
     assert env.batch.reset(options={"agent_scale": scale})[0] in env.batch.observation_space
 
 
+@pytest.mark.parametrize("speed", [14, 15, 16, 17, 84])
+def test_the_largest_agent_leaves_the_screen_at_any_speed(speed):
+    env, s = made(ENDLESS, 7, agent_scale=1.0, agent_speed=speed)
+    assert path_of(s)[0] == (0, SIDE - 1)  # the bottom row, from which the agent walks down
+    frame, *_ = env.step(3)
+    assert s.pos[0, 1] == (SIDE - 1) * TILE + 25 + speed + PAD
+    assert not has(frame, BODY)
+    frame, *_ = env.step(3)
+    assert has(frame, BODY)
+
+
 # ---- endless episodes ----
 
 
@@ -380,14 +392,15 @@ def test_debug_render_shows_the_path(env_id):
         assert frame.dtype == np.uint8
         offset = s.pos[0, 0] - s.origin[0, 0] - 60 if endless else 0
         path = path_of(s)
-        kinds = dict.fromkeys(path, WHITE) | {path[0]: BLUE} | ({} if endless else {path[-1]: GREEN})
+        kinds = {place: BLUE if place[0] % SEGMENT == SIDE else WHITE for place in path}
+        kinds |= {path[0]: BLUE} | ({} if endless else {path[-1]: GREEN})
         for segment, walls in enumerate(s.walls[0, : s.segments[0]].tolist()):
             places = [divmod(place, SIDE) for place in range(SIDE * SIDE) if walls >> place & 1]
             kinds |= {(column + SEGMENT * segment, row): RED for column, row in places}
         shown = 0
         for (column, row), color in kinds.items():
             x, y = 4 * (column * TILE - offset), 4 * row * TILE
-            seen = tuple(frame[y + 2, x + 2].tolist()) if 0 <= x < 336 else None
+            seen = tuple(frame[y + 6, x + 6].tolist()) if 0 <= x < 330 else None
             if seen in (GREEN, BLUE, RED, WHITE):  # not the agent
                 assert seen == color
                 shown += 1
