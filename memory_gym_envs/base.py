@@ -295,7 +295,7 @@ class MemoryGymVectorEnv(VectorEnv):
         """final_obs and final_info of the lanes whose episode ended, as SyncVectorEnv lays them out."""
         mask = np.zeros(self.num_envs, bool)
         mask[ended] = True
-        final_obs = np.full(self.num_envs, None, object)
+        final_obs = np.empty(self.num_envs, object)
         for lane in ended.tolist():
             final_obs[lane] = one_of(observations, lane)
         truth = self.ground_truth()

@@ -14,9 +14,11 @@ from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.entries import Entries
 
 LARGEST = radius_of(1.0)
-UNSEEN = SPAN  # the position of an agent of which nothing shows
-PLACES = np.append((np.arange(SPAN) - PAD) / SCREEN, 0.0).astype(np.float32)  # the entry for each stored position
+UNSEEN = SPAN  # the position of an agent of which nothing shows, and its size
+# What entries say, by their code: stored positions, then UNSEEN, then sizes.
+VALUES = np.concatenate([(np.arange(SPAN) - PAD) / SCREEN, np.arange(1 + LARGEST) / LARGEST]).astype(np.float32)
 FLAGS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little").astype(np.float32)
+NOTHING = (UNSEEN, UNSEEN, UNSEEN, 0)  # the codes
 PLACE_STRIDES = np.array([1, SPAN])
 
 
@@ -43,8 +45,7 @@ class View(NamedTuple):
 class Looks(NamedTuple):
     """The tables of all views in use, stacked: row view * FACINGS + facing is a sprite's."""
 
-    size: np.ndarray  # (R,) float32: the entry of that name
-    seen: np.ndarray  # (R * P * P, 3) uint8: x and y, stored, and the facings as bits
+    seen: np.ndarray  # (R * P * P, 4) uint8: codes of size, x and y, and the facings as bits
     solid: np.ndarray  # (R, W + 2, W + 2) bool: the sprites with a transparent rim
 
 
@@ -55,26 +56,25 @@ def make_looks(views: list[View]) -> Looks:
     for view in views:
         margin = (width - view.solid.shape[1]) // 2
         solids.append(np.pad(view.solid, ((0, 0), (margin, margin), (margin, margin))))
-    size = np.repeat([radius_of(view.scale) / LARGEST for view in views], FACINGS).astype(np.float32)
-    return Looks(size, np.concatenate([see(view) for view in views]), np.concatenate(solids))
+    return Looks(np.concatenate([see(view) for view in views]), np.concatenate(solids))
 
 
 def see(view: View) -> np.ndarray:
-    """(FACINGS * P * P, 3) uint8: Looks.seen of one view. What looks the same has the same entries."""
+    """(FACINGS * P * P, 4) uint8: Looks.seen of one view. What looks the same has the same codes."""
     prints = fingerprints(view)
     _, kind = np.unique(prints, return_inverse=True)
     kind = kind.reshape(-1)
     facing, y, x = (index.reshape(-1) for index in np.indices(prints.shape))
     alike, count = np.zeros((kind.max() + 1, FACINGS), bool), np.bincount(kind)
     alike[kind, facing] = True
-    middle = [np.rint(np.bincount(kind, place) / count) for place in (x, y)]
-    facings = np.packbits(alike, axis=1, bitorder="little")[:, 0]
-    kinds = np.stack([middle[0] + view.columns.start, middle[1] + view.rows.start, facings], axis=1).astype(np.uint8)
-    kinds[kind[prints.reshape(-1) == 0]] = (UNSEEN, UNSEEN, 0)
-    table = np.full((FACINGS, SPAN, SPAN, 3), (UNSEEN, UNSEEN, 0), np.uint8)
+    column, row = (np.rint(np.bincount(kind, place) / count) for place in (x, y))
+    size, facings = np.full_like(count, UNSEEN + radius_of(view.scale)), np.packbits(alike, axis=1, bitorder="little")
+    codes = np.column_stack([size, column + view.columns.start, row + view.rows.start, facings]).astype(np.uint8)
+    codes[kind[prints.reshape(-1) == 0]] = NOTHING
+    table = np.full((FACINGS, SPAN, SPAN, len(NOTHING)), NOTHING, np.uint8)
     reach = (slice(None), slice(view.rows.start, view.rows.stop), slice(view.columns.start, view.columns.stop))
-    table[reach] = kinds[kind].reshape(*prints.shape, 3)
-    return table.reshape(-1, 3)
+    table[reach] = codes[kind].reshape(*prints.shape, len(NOTHING))
+    return table.reshape(-1, len(NOTHING))
 
 
 def fingerprints(view: View) -> np.ndarray:
@@ -101,10 +101,9 @@ def fingerprints(view: View) -> np.ndarray:
 
 def look(out: np.ndarray, looks: Looks, sprite: np.ndarray, pos: np.ndarray) -> None:
     """Writes the entries of the agents with these sprites (n,) at these positions (n, 2) to out, (n, 11)."""
-    seen = looks.seen.take(sprite * (SPAN * SPAN) + pos.dot(PLACE_STRIDES), axis=0)  # (n, 3)
-    out[:, 0] = looks.size.take(sprite) * (seen[:, 2] > 0)
-    out[:, 1:3] = PLACES.take(seen[:, :2])
-    out[:, 3:] = FLAGS.take(seen[:, 2], axis=0)
+    seen = looks.seen.take(sprite * (SPAN * SPAN) + pos.dot(PLACE_STRIDES), axis=0)  # (n, 4)
+    out[:, :3] = VALUES.take(seen[:, :3])
+    out[:, 3:] = FLAGS.take(seen[:, 3], axis=0)
 
 
 def covered(looks: Looks, sprite: np.ndarray, pos: np.ndarray, points: np.ndarray) -> np.ndarray:

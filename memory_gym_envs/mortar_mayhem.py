@@ -3,6 +3,7 @@
 Shape letters: N lanes, n some of them, C commands that fit, L steps that the longest clue needs.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any, NamedTuple
@@ -28,6 +29,7 @@ from memory_gym_envs.drawing import ROW, SCREEN, Sheet, paste, ring, turned_45
 from memory_gym_envs.entries import Entries, vector_slices
 from memory_gym_envs.looks import LARGEST, Looks, View, agent_entries, covered, look, make_looks
 from memory_gym_envs.options import Option
+from memory_gym_envs.words import below, words
 
 TILE = 14  # pixels
 SIZES = range(2, 7)  # tiles along one side of the arena
@@ -36,7 +38,6 @@ TORUS_SIZE = 6  # fills the screen
 # In the original's order: allowed_commands=k allows the first k.
 COMMANDS = ("right", "down", "left", "up", "stay", "right_down", "right_up", "left_down", "left_up")
 MOVES = np.array([(1, 0), (0, 1), (-1, 0), (0, -1), (0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)])  # (9, 2) tiles
-MOVES_LIST = MOVES.tolist()  # for one lane at a time
 VECTOR_ORDER = ("stay", "right", "left", "up", "down", "right_down", "right_up", "left_down", "left_up")
 VECTOR_AT = [VECTOR_ORDER.index(command) for command in COMMANDS]
 VECTOR_COMMANDS = 20  # commands that the command vector has room for
@@ -118,14 +119,15 @@ VARIANTS = {
 
 @dataclass
 class State:
-    """One array a field, one row a lane. Positions are stored with PAD added, targets are tiles."""
+    """One array a field, one row a lane. Positions are stored with PAD added, tiles are rows of floors()."""
 
     pos: np.ndarray  # (N, 2) the agent's centre, x and y
     facing: np.ndarray  # (N,)
     figure: np.ndarray  # (N,) which of the batch's figures the agent is
     size: np.ndarray  # (N,) tiles along one side
-    floor: np.ndarray  # (N,) picture of the arena, a row of floors()
-    target: np.ndarray  # (N, 2) the tile to reach
+    blue: np.ndarray  # (N,) picture of the arena when nothing burns, a row of floors()
+    floor: np.ndarray  # (N,) picture of the arena now
+    target: np.ndarray  # (N,) the tile to reach
     goal: np.ndarray  # (N, 2) the first pixel of that tile, with PAD
     truth: np.ndarray  # (N, 2) float64: that tile, divided by arena size - 1
     commands: np.ndarray  # (N, C)
@@ -155,7 +157,7 @@ class State:
 
 def empty_state(lanes: int) -> State:
     """The state of N lanes before their first reset."""
-    shapes = {"pos": (2,), "target": (2,), "goal": (2,), "truth": (2,), "commands": (1,), "clue": (1,)}
+    shapes = {"pos": (2,), "goal": (2,), "truth": (2,), "commands": (1,), "clue": (1,)}
     shapes["vector"] = (VECTOR_COMMANDS * len(COMMANDS),)
     kinds = {"lit": bool, "feedback": bool, "clue": np.uint8, "vector": np.float32}
     kinds |= dict.fromkeys(("truth", "returned", "reward_success", "reward_failure", "reward_episode"), np.float64)
@@ -169,7 +171,7 @@ def empty_state(lanes: int) -> State:
 class Level(NamedTuple):
     """What the generator decides at a reset."""
 
-    tile: tuple[int, int]
+    tile: int  # column * arena size + row
     offset: tuple[int, int]
     commands: list[int]
     show: int
@@ -180,66 +182,62 @@ class Level(NamedTuple):
 
 def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
     """Draws a level in the original's order, so that its seeds mean the same here."""
+    word = words(rng)
     size = TORUS_SIZE if variant.endless else values["arena_size"]
-    tile = divmod(int(rng.integers(0, size * size)), size)
-    offset = (int(rng.integers(-2, 2)), int(rng.integers(-2, 2))) if variant.jitter else (0, 0)
+    tile = below(word, size * size)
+    offset = (below(word, 4) - 2, below(word, 4) - 2) if variant.jitter else (0, 0)
     if variant.endless:
         kinds = values["allowed_commands"]
-        commands = [int(rng.integers(ZERO, BELOW[kinds])) for _ in range(values["initial_command_count"])]
+        commands = [below(word, kinds) for _ in range(values["initial_command_count"])]
     else:
-        commands = draw_walk(rng, tile, _pick(rng, values["command_count"]), size, values["allowed_commands"])
-    show = _pick(rng, values["command_show_duration"]) if variant.clue else 0
-    gap = _pick(rng, values["command_show_delay"]) if variant.clue else 0
-    burn = _pick(rng, values["explosion_duration"])
-    return Level(tile, offset, commands, show, gap, burn, _pick(rng, values["explosion_delay"]))
+        commands = draw_walk(word, tile, _pick(word, values["command_count"]), size, values["allowed_commands"])
+    show = _pick(word, values["command_show_duration"]) if variant.clue else 0
+    gap = _pick(word, values["command_show_delay"]) if variant.clue else 0
+    burn = _pick(word, values["explosion_duration"])
+    return Level(tile, offset, commands, show, gap, burn, _pick(word, values["explosion_delay"]))
 
 
-def draw_walk(rng: np.random.Generator, tile: tuple[int, int], count: int, size: int, kinds: int) -> list[int]:
+def draw_walk(word: Callable[[], int], tile: int, count: int, size: int, kinds: int) -> list[int]:
     """Commands that lead from the tile through the arena without leaving it."""
     steps = _valid_commands(size, kinds)
     commands = []
     for _ in range(count):
         valid = steps[tile]
-        command, tile = valid[rng.integers(ZERO, BELOW[len(valid)])]
+        command, tile = valid[below(word, len(valid))]
         commands.append(command)
     return commands
 
 
-# Arrays without dimensions: the generator takes them faster than numbers, and draws the same.
-ZERO, BELOW = np.array(0), [np.array(limit) for limit in range(len(COMMANDS) + 1)]
-
-
 @cache
-def _valid_commands(size: int, kinds: int) -> dict[tuple[int, int], list[tuple[int, tuple[int, int]]]]:
+def _valid_commands(size: int, kinds: int) -> list[list[tuple[int, int]]]:
     """For every tile the commands that stay inside the arena, each with the tile it leads to."""
     moves = list(enumerate(MOVES[:kinds].tolist()))
-    tiles = [(x, y) for x in range(size) for y in range(size)]
-    inside = set(tiles)
-    return {
-        (x, y): [(command, (x + dx, y + dy)) for command, (dx, dy) in moves if (x + dx, y + dy) in inside]
-        for x, y in tiles
-    }
+    return [
+        [
+            (command, (x + dx) * size + y + dy)
+            for command, (dx, dy) in moves
+            if 0 <= x + dx < size and 0 <= y + dy < size
+        ]
+        for x in range(size)
+        for y in range(size)
+    ]
 
 
-def _pick(rng: np.random.Generator, values: tuple[int, ...]) -> int:
+def _pick(word: Callable[[], int], values: tuple[int, ...]) -> int:
     """What Generator.choice would pick. It draws nothing from a single value."""
-    return values[0] if len(values) == 1 else values[int(rng.integers(0, len(values)))]
+    return values[0] if len(values) == 1 else values[below(word, len(values))]
 
 
 def write_level(s: State, lane: int, level: Level, variant: Variant) -> None:
     """Starts the lane's episode at this level."""
-    size, count = int(s.size[lane]), len(level.commands)
-    origin = SCREEN // 2 - TILE * size // 2 + PAD
-    (x, y), (dx, dy) = level.tile, MOVES_LIST[level.commands[0]]
-    target = ((x + dx) % size, (y + dy) % size)  # only on a torus does a command lead across the border
-    for axis, start in enumerate(level.tile):
-        s.pos[lane, axis] = origin + TILE * start + TILE // 2 + level.offset[axis]
-        s.target[lane, axis] = target[axis]
-        s.goal[lane, axis] = origin + TILE * target[axis]
-        s.truth[lane, axis] = target[axis] / (size - 1)
+    count, tiles, start = len(level.commands), tile_tables(), int(s.blue[lane]) + 1 + level.tile
+    s.pos[lane] = tiles.corner[start] + TILE // 2
+    if variant.jitter:
+        s.pos[lane] += level.offset
+    aim(s, lane, tiles.next[start, level.commands[0]])
     s.facing[lane] = s.current[lane] = s.completed[lane] = s.length[lane] = s.returned[lane] = 0
     s.lit[lane] = False
-    s.floor[lane] = floor_row(size)
+    s.floor[lane] = s.blue[lane]
     s.count[lane] = count
     s.commands[lane, :count] = level.commands
     s.fuse[lane], s.burn[lane], s.show[lane], s.gap[lane] = level.fuse, level.burn, level.show, level.gap
@@ -257,11 +255,13 @@ def write_level(s: State, lane: int, level: Level, variant: Variant) -> None:
 
 def write_clue(s: State, lane: int, commands: list[int]) -> None:
     """Plans what the lane sees at each step of a clue: every command for a while, then nothing for a while."""
-    period = int(s.show[lane] + s.gap[lane])
+    show = int(s.show[lane])
+    period = show + int(s.gap[lane])
     end = period * len(commands)
     plan = s.clue[lane]  # (L,)
     plan[: end + 1] = BLANK
-    plan[:end].reshape(len(commands), period)[:, : s.show[lane]] = np.array(commands)[:, None] + 1
+    for start, command in zip(range(0, end, period), commands, strict=True):
+        plan[start : start + show] = 1 + command
     s.clue_end[lane] = end
 
 
@@ -273,9 +273,8 @@ GREEN = (0, 255, 0)
 SYMBOL, SYMBOL_AT = 24, 31  # width of the symbols' square, and its first pixel on both axes
 
 
-def floor_row(size: int) -> int:
-    """The row of floors() that shows an arena of this size in blue; the lit ones follow, by target tile."""
-    return sum(1 + smaller * smaller for smaller in range(SIZES[0], size))
+# The rows of floors(): every arena in blue, and then burning around each tile. Such a row stands for that tile, too.
+FLOORS = [(size, tile) for size in SIZES for tile in (None, *((x, y) for x in range(size) for y in range(size)))]
 
 
 @cache
@@ -283,21 +282,35 @@ def floors() -> np.ndarray:
     """(F, FRAME) uint8, read-only: every arena, blue or burning around each possible target."""
     blue, red = (np.tile(np.array(color, np.uint8), (TILE, TILE, 1)) for color in (LIGHT_BLUE, LIGHT_RED))
     blue[1:-1, 1:-1], red[1:-1, 1:-1] = BLUE, RED
-    pictures = []
-    for size in SIZES:
-        targets = [None, *((x, y) for x in range(size) for y in range(size))]
-        for target in targets:
-            frame = np.zeros((SCREEN, SCREEN, 3), np.uint8)
-            origin = SCREEN // 2 - TILE * size // 2
-            for x in range(size):
-                for y in range(size):
-                    tile = blue if target is None or (x, y) == target else red
-                    top, left = origin + TILE * y, origin + TILE * x
-                    frame[top : top + TILE, left : left + TILE] = tile
-            pictures.append(frame.reshape(-1))
-    table = np.stack(pictures)
+    table = np.zeros((len(FLOORS), SCREEN, SCREEN, 3), np.uint8)
+    for frame, (size, target) in zip(table, FLOORS, strict=True):
+        origin = SCREEN // 2 - TILE * size // 2
+        for x in range(size):
+            for y in range(size):
+                top, left = origin + TILE * y, origin + TILE * x
+                frame[top : top + TILE, left : left + TILE] = blue if target in (None, (x, y)) else red
+    table = table.reshape(len(FLOORS), -1)
     table.flags.writeable = False
     return table
+
+
+class Tiles(NamedTuple):
+    """What there is to know of tiles, by row of floors()."""
+
+    corner: np.ndarray  # (F, 2) the first pixel, with PAD
+    truth: np.ndarray  # (F, 2) column and row, divided by arena size - 1
+    next: np.ndarray  # (F, 9) the tile that each command leads to, on a torus
+
+
+@cache
+def tile_tables() -> Tiles:
+    """The tables of all tiles. Where a row is no tile, they hold those of the arena's first."""
+    rows = {floor: row for row, floor in enumerate(FLOORS)}
+    places = [(size, *(tile or (0, 0))) for size, tile in FLOORS]
+    size, x, y = np.array(places).T[..., None]  # (F, 1) each
+    corner = SCREEN // 2 - TILE * size // 2 + PAD + TILE * np.hstack([x, y])
+    ahead = [[rows[size, ((x + dx) % size, (y + dy) % size)] for dx, dy in MOVES.tolist()] for size, x, y in places]
+    return Tiles(corner, np.hstack([x, y]) / (size - 1), np.array(ahead))
 
 
 @cache
@@ -348,18 +361,10 @@ CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # (4, 2)
 
 @cache
 def floor_entries() -> np.ndarray:
-    """(F, 4) float32, read-only: arena, fire and safe tile, for every row of floors()."""
-    rows = []
-    for size in SIZES:
-        first = SCREEN // 2 - TILE * size // 2 + TILE // 2
-        rows.append((size / SIZES[-1], 0, 0, 0))
-        for x in range(size):
-            rows += [
-                (size / SIZES[-1], 1, (first + TILE * x) / SCREEN, (first + TILE * y) / SCREEN) for y in range(size)
-            ]
-    table = np.array(rows, np.float32)
-    table.flags.writeable = False
-    return table
+    """(F, 4) float32: arena, fire and safe tile, for every row of floors()."""
+    size, fire = np.array([(size / SIZES[-1], tile is not None) for size, tile in FLOORS]).T
+    safe = (tile_tables().corner - PAD + TILE // 2) / SCREEN * fire[:, None]
+    return np.column_stack([size, fire, safe]).astype(np.float32)
 
 
 @cache
@@ -428,7 +433,7 @@ def light(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     s.lit[lanes] = True
     s.timer[lanes] = s.burn[lanes]
     seen = lanes[s.feedback[lanes]]
-    s.floor[seen] += 1 + s.target[seen, 0] * s.size[seen] + s.target[seen, 1]
+    s.floor[seen] = s.target[seen]
     hit = on_target(s, lanes)
     s.completed[lanes] += hit
     return hit, s.current[lanes] >= s.count[lanes]
@@ -436,15 +441,17 @@ def light(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def put_out(s: State, lanes: np.ndarray) -> None:
     """Puts the fire out and moves the target on by the next command."""
-    seen = lanes[s.feedback[lanes]]
-    s.floor[seen] -= 1 + s.target[seen, 0] * s.size[seen] + s.target[seen, 1]
+    s.floor[lanes] = s.blue[lanes]
     s.lit[lanes] = False
     s.timer[lanes] = s.fuse[lanes]
-    size = s.size[lanes][:, None]  # (n, 1)
-    target = (s.target[lanes] + MOVES[s.commands[lanes, s.current[lanes]]]) % size  # (n, 2)
-    s.target[lanes] = target
-    s.goal[lanes] = SCREEN // 2 - TILE * size // 2 + PAD + TILE * target
-    s.truth[lanes] = target / (size - 1)
+    aim(s, lanes, tile_tables().next[s.target[lanes], s.commands[lanes, s.current[lanes]]])
+
+
+def aim(s: State, lanes: np.ndarray | int, tile: np.ndarray | int) -> None:
+    """Makes these tiles the targets of the lanes."""
+    s.target[lanes] = tile
+    s.goal[lanes] = tile_tables().corner[tile]
+    s.truth[lanes] = tile_tables().truth[tile]
 
 
 class MortarMayhem(MemoryGymVectorEnv):
@@ -511,6 +518,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         """Takes over the options of the lanes, and the tables that all lanes' options need."""
         s, variant, values = self.state, self.variant, self.settings[int(lanes[0])]
         s.size[lanes] = values.get("arena_size", TORUS_SIZE)
+        s.blue[lanes] = FLOORS.index((values.get("arena_size", TORUS_SIZE), None))
         s.feedback[lanes] = values["visual_feedback"]
         s.reward_success[lanes] = values["reward_command_success"]
         s.reward_failure[lanes] = values["reward_command_failure"]
@@ -541,6 +549,8 @@ class MortarMayhem(MemoryGymVectorEnv):
         self._lane_clue = np.arange(self.num_envs) * self.state.clue.shape[1]  # (N,)
         if self.obs_type == "vector":
             self._looks = looks(self.figures, self.variant.clue)
+            views = len(symbols()) if self.variant.clue else 1
+            self._lane_sprites = self.state.figure * (views * FACINGS)  # (N,)
             self._at = vector_slices(self.variant.entries)
             # An agent that is no wider than a tile cannot hide one.
             self._large = any(2 * figure.reach > TILE for figure in self.figures)
@@ -561,7 +571,7 @@ class MortarMayhem(MemoryGymVectorEnv):
             s.timer -= acting
             due = s.timer == 0  # only a lane that acts gets there
             if np.count_nonzero(due):
-                self._change_tiles(np.flatnonzero(due), rewards, terminated)
+                self._change_tiles(due.nonzero()[0], rewards, terminated)
             burning = s.lit & acting
             if np.count_nonzero(burning):
                 fallen = burning & ~on_target(s, ALL)
@@ -608,7 +618,7 @@ class MortarMayhem(MemoryGymVectorEnv):
     def _grow(self, lane: int) -> None:
         """Appends a command to the lane's completed sequence and shows it from the next step on."""
         s = self.state
-        command = int(self._rngs[lane].integers(0, self.settings[lane]["allowed_commands"]))
+        command = below(words(self._rngs[lane]), self.settings[lane]["allowed_commands"])
         length = int(s.count[lane])
         if length == s.commands.shape[1]:
             s.commands = widened(s.commands, 2 * length)
@@ -627,20 +637,20 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32."""
-        s, at, clue = self.state, self._at, self.variant.clue
-        symbol = s.symbol[lanes]
-        view = s.figure[lanes] * len(symbols()) + symbol if clue else s.figure[lanes]
-        sprite = view * FACINGS + s.facing[lanes]  # (n,)
-        out = np.empty((len(symbol), *self.single_observation_space.shape), np.float32)
+        s, at = self.state, self._at
+        sprite = self._lane_sprites[lanes] + s.facing[lanes]  # (n,)
+        out = np.empty((len(sprite), *self.single_observation_space.shape), np.float32)
+        if self.variant.clue:
+            symbol = s.symbol[lanes]
+            sprite += symbol * FACINGS
+            out[:, at["command"]] = COMMAND_ENTRIES.take(symbol, axis=0)
+        else:
+            out[:, at["commands"]] = s.vector[lanes]
         look(out[:, at["size"].start : at["facing"].stop], self._looks, sprite, s.pos[lanes])
         floor = out[:, at["arena"].start : at["safe"].stop]
         floor[:] = floor_entries().take(s.floor[lanes], axis=0)
         if self._large:
             hide_floor(floor, s, lanes, sprite, self._looks)
-        if clue:
-            out[:, at["command"]] = COMMAND_ENTRIES.take(symbol, axis=0)
-        else:
-            out[:, at["commands"]] = s.vector[lanes]
         return out
 
     def frames(self, lanes: np.ndarray | slice) -> np.ndarray:

@@ -181,6 +181,7 @@ class State:
     lap: np.ndarray  # (N,) pixels after which the background starts again
     figure_x: np.ndarray  # (N,) where the agent is drawn, in the endless id
     cross_x: np.ndarray  # (N,) likewise the cross
+    cross_fits: np.ndarray  # (N,) bool: that is on the screen, not behind the stamina bar
     limit: np.ndarray  # (N,) steps until truncation
     stamina_level: np.ndarray  # (N,)
     reward_goal: np.ndarray  # (N,) float64
@@ -195,7 +196,7 @@ def empty_state(lanes: int, segments: int) -> State:
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("pos", "origin", "tile"), (2,))
     shapes |= {"walls": (segments,), "speed": (1,), "step_at": cells, "known": cells}
     shapes |= dict.fromkeys(("cell", "heading_at", "fresh", "restful"), steps)
-    flags = ("fallen", "past", "hurt", "fresh", "restful", "known", "extras", "feedback")
+    flags = ("fallen", "past", "hurt", "cross_fits", "fresh", "restful", "known", "extras", "feedback")
     kinds: dict[str, Any] = dict.fromkeys((*flags, *(f"show_{what}" for what in SHOWN)), bool)
     kinds |= dict.fromkeys(("returned", "camera"), np.float64) | {"heading_at": np.uint8}
     kinds |= dict.fromkeys(("reward_goal", "reward_fall_off", "reward_progress", "reward_step"), np.float64)
@@ -599,6 +600,7 @@ def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: np.ndarray | s
 
 # ---- vector observations ----
 
+CROSS_FITS = abs(np.arange(SPAN) - PAD - SCREEN // 2) < (SCREEN + CROSS) // 2  # of stored positions along y
 CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # (4, 2)
 
 
@@ -647,25 +649,21 @@ def show_ends(out: np.ndarray, s: State, lanes: np.ndarray | slice, looks: Looks
         out[:, end : end + 2] = (centre - PAD) / SCREEN * shown[:, None]
 
 
-def show_trail(out: np.ndarray, s: State, lanes: np.ndarray | slice, looks: Looks, agent: tuple | None) -> None:
-    """Writes the past path and the scroll of its tiles to out, (n, 57) and zeros so far.
+def show_trail(out: np.ndarray, s: State, lanes: np.ndarray | slice, looks: Looks, agent: Any) -> None:
+    """Writes the past path and the scroll of its tiles to out, (n, 57) and zeros so far. A tile shows if a corner does.
 
-    agent: its sprites (n,) and where they are drawn (n, 2), if it is large enough to hide a tile.
+    agent: sprites (n,) and where they are drawn (n, 2) of agents that may hide a tile, or None.
     """
     owner, x, y = trail_on_screen(s, lanes)
-    # A tile shows where one of its corners does. The background has the same corners, but not the pixels inside them.
-    inset = s.show_ground[lanes][owner]  # (m,)
-    width = (SCREEN - BAR * s.show_stamina[lanes])[owner]
-    left, right = x + inset, x + TILE - 1 - inset
-    if agent is None:
-        shown = (left < width) & (right >= 0)
-    else:
-        sprite, pos = (each[owner] for each in agent)
-        points = (
-            np.stack([x, y], axis=1)[:, None] + inset[:, None, None] + CORNERS * (TILE - 1 - 2 * inset)[:, None, None]
-        )
-        free = (points[..., 0] >= 0) & (points[..., 0] < width[:, None])
-        shown = (free & ~covered(looks, sprite, pos, points + PAD)).any(axis=1)
+    inset, width = 0, SCREEN
+    if np.count_nonzero(s.extras[lanes]):
+        # The background has the same corners, but not the pixels inside them.
+        inset, width = s.show_ground[lanes][owner], (SCREEN - BAR * s.show_stamina[lanes])[owner]  # (m,)
+    shown = (x + inset < width) & (x + (TILE - 1) - inset >= 0)
+    if agent is not None:
+        corners = np.stack([x, y], axis=1)[:, None] + abs(CORNERS * (TILE - 1) - np.reshape(inset, (-1, 1, 1)))
+        free = (corners[..., 0] >= 0) & (corners[..., 0] < np.reshape(width, (-1, 1)))  # (m, 4)
+        shown = (free & ~covered(looks, *(each[owner] for each in agent), corners + PAD)).any(axis=1)
     owner, x, y = owner[shown], x[shown], y[shown]
     out[owner, (x // TILE + 1) * SIDE + y // TILE] = 1.0
     # Not all of a path's tiles have the same, where the camera is between two pixels.
@@ -839,6 +837,7 @@ class MysteryPath(MemoryGymVectorEnv):
         s.speed[lanes] = speed
         s.lap[lanes] = speed * math.ceil(TILE / speed) if speed else 1
         s.figure_x[lanes], s.cross_x[lanes] = camera_columns(values)
+        s.cross_fits[lanes] = camera_columns(values)[1] < PAD + SCREEN - BAR * values["show_stamina"] + CROSS // 2
 
     def _figure(self, values: dict[str, Any]) -> Figure:
         if self.variant.grid:
@@ -962,17 +961,10 @@ class MysteryPath(MemoryGymVectorEnv):
         s, at = self.state, self._at
         hurt = s.hurt[lanes]
         if np.count_nonzero(hurt):
-            width = SCREEN - BAR * s.show_stamina[lanes]
-            on_screen = abs(2 * (pos[:, 1] - PAD) - SCREEN) < SCREEN + CROSS
-            out[:, at["cross"].start] = hurt & on_screen & (s.cross_x[lanes] - PAD - CROSS // 2 < width)
+            out[:, at["cross"].start] = hurt & s.cross_fits[lanes] & CROSS_FITS.take(pos[:, 1])
         if np.count_nonzero(s.past[lanes]):
-            show_trail(
-                out[:, at["past"].start : at["scroll"].stop],
-                s,
-                lanes,
-                self._looks,
-                (sprite, pos) if self._large else None,
-            )
+            trail = out[:, at["past"].start : at["scroll"].stop]
+            show_trail(trail, s, lanes, self._looks, (sprite, pos) if self._large else None)
         if np.count_nonzero(s.extras[lanes]):
             out[:, at["ground"].start] = ground_rows(s, lanes) / TILE
             out[:, at["bar"].start] = s.show_stamina[lanes]
