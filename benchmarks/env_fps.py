@@ -1,10 +1,10 @@
-"""Steps per second of every id, alone and 32 in one process, on one core, beside memory-gym's where installed.
+"""Steps per second of every id, alone and many in one process, on one core, beside memory-gym's where installed.
 
-    python benchmarks/env_fps.py [--seconds S] [--num-envs N] [--ids ID ...]
+    python benchmarks/env_fps.py [--seconds S] [--num-envs N] [--many-envs M] [--ids ID ...]
 
-Prints a Markdown table. Actions are random, resets included. memory-gym is optional: without it, its columns are empty.
-The measurements of the two packages take turns, and each column shows the best of its rounds, because machines are
-noisy. Ratios are what to quote.
+Prints two Markdown tables, of frames and of vector observations, both beside memory-gym's one environment. Actions are
+random, resets included. memory-gym is optional: without it, its columns are empty. The measurements of the two packages
+take turns, and each column shows the best of its rounds, because machines are noisy. Ratios are what to quote.
 """
 
 import argparse
@@ -36,6 +36,7 @@ ORIGINALS = {
     "Endless-SearingSpotlights-v0": ("endless_searing_spotlights", "EndlessSearingSpotlightsEnv"),
 }
 COLUMNS = ["id", "memory-gym", "one", "ratio", "{n} lanes", "ratio", "reset, memory-gym", "reset", "ratio"]
+VECTOR_COLUMNS = ["id", "memory-gym", "{n} lanes", "ratio", "{m} lanes", "ratio"]
 ACTIONS = 256  # sampled before the clock starts
 
 
@@ -82,31 +83,56 @@ def reset_rate(env, seconds: float) -> float:
     return resets / (time.perf_counter() - start)
 
 
-def measure(id_: str, original: type | None, num_envs: int, seconds: float, rounds: int = 4) -> dict[str, float]:
-    """The best rate of every measurement over the rounds, in which the packages take turns."""
-    ours, lanes = gym.make(id_), gym.make_vec(id_, num_envs=num_envs)
-    theirs = original() if original else None
-    tasks = [("one", single_rate, ours), ("lanes", vector_rate, lanes), ("reset", reset_rate, ours)]
-    if theirs is not None:
+def measure(
+    id_: str, original: type | None, lanes: tuple[int, int], seconds: float, rounds: int = 4
+) -> dict[str, float]:
+    """The best rate of every measurement over the rounds, in which the packages take turns.
+
+    lanes: of the vector environment, and of a larger one with vector observations.
+    """
+    one = gym.make(id_)
+    tasks = [("one", single_rate, one), ("lanes", vector_rate, gym.make_vec(id_, num_envs=lanes[0]))]
+    tasks.append(("reset", reset_rate, one))
+    if one.unwrapped.batch.variant.entries:
+        for name, num_envs in zip(("vectors", "many vectors"), lanes, strict=True):
+            tasks.append((name, vector_rate, gym.make_vec(id_, num_envs=num_envs, obs_type="vector")))
+    if original:
+        theirs = original()
         tasks[1:1] = [("their one", single_rate, theirs), ("their reset", reset_rate, theirs)]
     best: dict[str, float] = {}
     for _ in range(rounds):
         for name, rate, env in tasks:
             best[name] = max(best.get(name, 0.0), rate(env, seconds / rounds))
-    ours.close()
-    lanes.close()
+    for _, _, env in tasks:
+        env.close()
     return best
 
 
+def cells(best: dict[str, float], *names: str) -> list[str]:
+    """The rates of these names, and behind each but memory-gym's own its ratio to that."""
+    theirs, texts = best.get("their one"), []
+    for name in names:
+        texts.append(f"{best[name]:,.0f}" if name in best else "")
+        if name != "their one":
+            texts.append(f"{best[name] / theirs:.1f}" if theirs else "")
+    return texts
+
+
 def row(id_: str, best: dict[str, float]) -> str:
-    """One line of the table. Resets are shown as microseconds each."""
-    their_one, their_reset = best.get("their one"), best.get("their reset")
-    cells = [f"`{id_}`", f"{their_one:,.0f}" if their_one else "", f"{best['one']:,.0f}"]
-    cells += [f"{best['one'] / their_one:.1f}" if their_one else "", f"{best['lanes']:,.0f}"]
-    cells += [f"{best['lanes'] / their_one:.1f}" if their_one else ""]
-    cells += [f"{1e6 / their_reset:,.0f} us" if their_reset else "", f"{1e6 / best['reset']:,.0f} us"]
-    cells += [f"{best['reset'] / their_reset:.1f}" if their_reset else ""]
-    return f"| {' | '.join(cells)} |"
+    """One line of the table of frames. Resets are shown as microseconds each."""
+    resets = [f"{1e6 / best[name]:,.0f} us" if name in best else "" for name in ("their reset", "reset")]
+    resets.append(f"{best['reset'] / best['their reset']:.1f}" if "their reset" in best else "")
+    return line(f"`{id_}`", *cells(best, "their one", "one", "lanes"), *resets)
+
+
+def line(*texts: str) -> str:
+    """One line of a Markdown table."""
+    return f"| {' | '.join(texts)} |"
+
+
+def heading(columns: list[str], lanes: tuple[int, int]) -> str:
+    """The first two lines of a table."""
+    return line(*columns).format(n=lanes[0], m=lanes[1]) + "\n|---" + "|---:" * (len(columns) - 1) + "|"
 
 
 def main() -> None:
@@ -114,10 +140,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=2.0, help="time for each number (default: 2)")
     parser.add_argument("--num-envs", type=int, default=32, help="lanes of the vector environment (default: 32)")
+    parser.add_argument("--many-envs", type=int, default=256, help="lanes of a larger one, vectors only (default: 256)")
     parser.add_argument("--ids", nargs="+", default=None, help="ids to measure (default: all)")
     args = parser.parse_args()
-    if args.seconds <= 0 or args.num_envs < 1:
-        parser.error("--seconds and --num-envs must be positive")
+    lanes = (args.num_envs, args.many_envs)
+    if args.seconds <= 0 or min(lanes) < 1:
+        parser.error("--seconds, --num-envs and --many-envs must be positive")
     warnings.filterwarnings("ignore")
     originals = original_classes()
     import memory_gym_envs  # after memory-gym, so that the ids are this package's
@@ -128,11 +156,15 @@ def main() -> None:
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     print("Steps per second; random actions, one process, one core" + ("." if originals else "; no memory-gym here."))
-    print()
-    print(f"| {' | '.join(COLUMNS)} |".format(n=args.num_envs))
-    print("|---" + "|---:" * (len(COLUMNS) - 1) + "|")
+    print(f"\nFrames:\n\n{heading(COLUMNS, lanes)}")
+    found = {}
     for id_ in args.ids or memory_gym_envs.IDS:
-        print(row(id_, measure(id_, originals.get(id_), args.num_envs, args.seconds)), flush=True)
+        found[id_] = measure(id_, originals.get(id_), lanes, args.seconds)
+        print(row(id_, found[id_]), flush=True)
+    print(f"\nVector observations:\n\n{heading(VECTOR_COLUMNS, lanes)}")
+    for id_, best in found.items():
+        if "vectors" in best:
+            print(line(f"`{id_}`", *cells(best, "their one", "vectors", "many vectors")))
 
 
 if __name__ == "__main__":

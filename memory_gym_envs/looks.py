@@ -25,8 +25,8 @@ PLACE_STRIDES = np.array([1, SPAN])
 def agent_entries(low: int, high: int) -> tuple[Entries, ...]:
     """The entries that `look` writes, for agents whose centre stays between these pixels on both axes."""
     size = f"radius of the agent's body, / {LARGEST} pixels; 0: nothing of the agent shows"
-    place = "the agent's centre, x and y, / 84 pixels; where several would look the same, their middle"
-    facing = "1 for each direction that the agent faces by its looks: up, up-left, left, ..., up-right"
+    place = "the agent's centre, x and y, / 84 pixels; the middle of all that would look the same"
+    facing = "one-hot: up, up-left, left, ..., up-right; 1 for each that would look the same"
     ends = min(low / SCREEN, 0.0), high / SCREEN
     return Entries("size", 1, size), Entries("place", 2, place, *ends), Entries("facing", FACINGS, facing)
 

@@ -471,7 +471,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         Discrete(4): 0 nothing, 1 turn left, 2 turn right, 3 one tile forward. Ignored while a clue is shown.
     Observation: Box (84, 84, 3) uint8, rows first. The B ids: Dict of `visual_observation`, that Box, and
         `vector_observation` (180,) float32: 20 commands by 9 one-hot entries in the order of VECTOR_ORDER, zeros after
-        the last command.
+        the last command. With obs_type="vector": `VARIANTS[id].entries`.
     Rewards: `reward_command_success` (0.1) when a command is checked and carried out, `reward_command_failure` (0) on a
         burning tile, `reward_episode_success` (0) when the last command was.
     Episode end: terminated by failure, or by the last command's check (not in the endless id). Truncated after

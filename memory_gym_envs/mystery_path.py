@@ -97,7 +97,7 @@ def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
 
 def _entries(endless: bool) -> tuple[Entries, ...]:
     """What a vector observation of an id is made of."""
-    cross = Entries("cross", 1, "1: a red cross shows that the agent fell off")
+    cross = Entries("cross", 1, "1: a red cross is seen, where the agent fell off")
     if not endless:
         places = [
             Entries(name, 2, f"the centre of the path's {name}, x and y, / 84 pixels; zeros: not shown, or hidden")
@@ -112,8 +112,8 @@ def _entries(endless: bool) -> tuple[Entries, ...]:
         *agent_entries(-PAD, SPAN - 1 - PAD),
         cross,
         Entries("past", SEGMENT * SIDE, past),
-        Entries("scroll", 1, "how far right of its column's left edge such a tile starts, / 12 pixels"),
-        Entries("ground", 1, "how far left the background has moved and 1, / 12 pixels; 0: there is none"),
+        Entries("scroll", 1, "how far right of its column's left edge each of them starts, / 12 pixels"),
+        Entries("ground", 1, "one more than how far left the background has moved, / 12 pixels; 0: there is none"),
         Entries("bar", 1, "1: the stamina bar is there"),
         Entries("stamina", 1, "how much of it is green"),
     )
@@ -771,7 +771,7 @@ class MysteryPath(MemoryGymVectorEnv):
     Actions: MultiDiscrete([3, 3]): horizontal (0 none, 1 left, 2 right) and vertical (0 none, 1 up, 2 down). Grid id
         Discrete(4): 0 nothing, 1 turn left, 2 turn right, 3 one tile forward. Endless id Discrete(4): 0 nothing,
         1 right, 2 up, 3 down.
-    Observation: Box (84, 84, 3) uint8, rows first.
+    Observation: Box (84, 84, 3) uint8, rows first. With obs_type="vector": `VARIANTS[id].entries`.
     Rewards: `reward_goal` (1) at the goal, `reward_path_progress` (0.1, Grid 0) for every other tile but the origin
         when it is reached for the first time, `reward_fall_off` (0) in the pit, and `reward_step` (0) at every step.
     Episode end: terminated at the goal. The endless id: terminated when no new tile was reached for `stamina_level`

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 import ppo_gru
@@ -13,11 +14,11 @@ import ppo_gru
 ROOT = Path(ppo_gru.__file__).parent
 
 
-def test_options_page():
-    made = subprocess.run(
-        [sys.executable, ROOT / "benchmarks/options_page.py"], capture_output=True, text=True, check=True
-    )
-    assert made.stdout == (ROOT / "docs/options.md").read_text()
+@pytest.mark.parametrize("name", ["options", "vectors"])
+def test_page(name):
+    program = ROOT / f"benchmarks/{name}_page.py"
+    made = subprocess.run([sys.executable, program], capture_output=True, text=True, check=True)
+    assert made.stdout == (ROOT / f"docs/{name}.md").read_text()
 
 
 def test_pictures(tmp_path):
