@@ -3,7 +3,9 @@
 Shape letters: N lanes, n some of them, M cells of the map, P steps of the path that fit, K of them drawn, S segments.
 """
 
+import functools
 import math
+import operator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
@@ -201,7 +203,7 @@ def make_room(s: State, steps: int, segments: int) -> bool:
 
 # ---- levels ----
 
-# While a path is drawn, a place is column * SIDE + row of a 7 x 7 grid, and a set of places is an integer's bits.
+# While a path is drawn, a place is column * SIDE + row of a 7 x 7 grid.
 PLACES = [divmod(place, SIDE) for place in range(SIDE * SIDE)]
 CELLS = [column * ROWS + BEYOND + row for column, row in PLACES]
 STRAIGHT = ((1, 0), (-1, 0), (0, 1), (0, -1))  # in the original's order
@@ -217,65 +219,82 @@ def _bits(places: list[int]) -> int:
     return sum(1 << place for place in places)
 
 
-NEIGHBOURS = [[(place, 1 << place) for place in _neighbours(x, y, STRAIGHT)] for x, y in PLACES]
+NEIGHBOURS = [_neighbours(x, y, STRAIGHT) for x, y in PLACES]
 NEAR = [_bits(_neighbours(x, y, ((0, 0), *STRAIGHT))) for x, y in PLACES]
-# Every inner place that may become a wall, with the eight around it; and the places of the border.
-INSIDE = [
-    (1 << place, _bits(_neighbours(x, y, STRAIGHT + OBLIQUE)))
-    for place, (x, y) in enumerate(PLACES)
-    if 0 < x < SIDE - 2 and 0 < y < SIDE - 2
-]
-BORDER = [1 << place for place, spot in enumerate(PLACES) if 0 in spot or SIDE - 1 in spot]
+AROUND = [_bits(_neighbours(x, y, STRAIGHT + OBLIQUE)) for x, y in PLACES]
+INSIDE = [place for place, (x, y) in enumerate(PLACES) if 0 < x < SIDE - 2 and 0 < y < SIDE - 2]  # may become walls
+BORDER = [(place, 1 << place) for place, spot in enumerate(PLACES) if 0 in spot or SIDE - 1 in spot]
 DISTANCES = [[math.sqrt((a - x) ** 2 + (b - y) ** 2) for a, b in PLACES] for x, y in PLACES]
+UNTRACEABLE, UNSEEN = 0, 1 << 20  # in place of the cost of the way to a place
 
+
+def _hit(places: list[int]) -> list[tuple[list[int], int]]:
+    """By which of the places are hit, a bit each: those places, and a set, in bits, of them and those around."""
+    hits = [[place for at, place in enumerate(places) if bits >> at & 1] for bits in range(1 << len(places))]
+    return [(hit, functools.reduce(operator.or_, [AROUND[place] for place in hit], 0)) for hit in hits]
+
+
+HALVES = [_hit(INSIDE[:8]), _hit(INSIDE[8:])]
 
 WALLS = 33  # the chance of a wall in percent
 # In 32-bit words: below which one that is, and the few for which a number below 100 is drawn again.
 WALL_WORDS = -((-WALLS << 32) // 100)
 AGAIN = {word for part in range(100) if (word := -((-part << 32) // 100)) * 100 % (1 << 32) < (1 << 32) % 100}
+WORD = (1 << 32) - 1
 
 
 class Tape:
-    """What a generator is about to draw, read ahead: a path takes a hundred numbers, and asking for each is slow.
+    """What a generator is about to draw, read ahead: a path takes dozens of numbers, and asking for each is slow.
 
-    All bounded integers are made of the generator's 32-bit words, which are drawn here at once. In the end, the
-    generator goes back and draws those that were used.
+    All bounded integers are made of 32-bit words, the halves of the bit generator's 64-bit ones, the lower half first.
+    The generator is left as if it had drawn the used ones only.
+
+    Raises ValueError for a bit generator that has no such halves, as MT19937.
     """
 
     def __init__(self, rng: np.random.Generator, paths: int):
-        self.rng, self.before, self.used = rng, rng.bit_generator.state, 0
+        self.bits = rng.bit_generator
+        self.before = self.bits.state
+        if "has_uint32" not in self.before:
+            raise ValueError(f"the generator must be made of 64-bit words, as PCG64 is, not {self.before['bit_generator']}")
         # A path takes 113 words at most, and one more for every number in ten million, which is drawn again.
-        self.words = rng.integers(0, 1 << 32, 120 * paths, np.uint32).tolist()
+        words = np.empty(1 + 120 * paths, np.uint32)
+        # The first one is the upper half of the word before, which the generator keeps, used or not.
+        words[0], words[1:] = self.before["uinteger"], self.bits.random_raw(60 * paths).view(np.uint32)
+        self.used = 1 - self.before["has_uint32"]
+        self.words = words.data
+        self.costs = (words >> 29).astype(np.uint8).tobytes()  # what below(8) makes of each
+        self.hits = int.from_bytes(np.packbits(words < WALL_WORDS, bitorder="little").tobytes(), "little")
 
     def below(self, limit: int) -> int:
         """What Generator.integers(0, limit) would draw (Lemire's method)."""
         if limit == 1:
             return 0
-        while True:
-            product = self.words[self.used] * limit
-            self.used += 1
-            if (product & 0xFFFFFFFF) >= limit or (product & 0xFFFFFFFF) >= (1 << 32) % limit:
-                return product >> 32
+        product = self.words[self.used] * limit
+        self.used += 1
+        if (product & WORD) < limit and (product & WORD) < (1 << 32) % limit:
+            return self.below(limit)
+        return product >> 32
 
-    def chances(self, count: int) -> list[bool]:
-        """Of so many numbers below 100, which are below WALLS."""
-        words = self.words[self.used : self.used + count]
-        if not AGAIN.isdisjoint(words):
-            return [self.below(100) < WALLS for _ in range(count)]
+    def chances(self, count: int) -> int:
+        """Of so many numbers below 100, which are below WALLS: a bit each."""
+        if not AGAIN.isdisjoint(self.words[self.used : self.used + count]):
+            return sum((self.below(100) < WALLS) << at for at in range(count))
         self.used += count
-        return [word < WALL_WORDS for word in words]
+        return self.hits >> (self.used - count) & ((1 << count) - 1)
 
     def close(self) -> None:
         """Leaves the generator as if it had drawn the used words only."""
-        self.rng.bit_generator.state = self.before
-        self.rng.integers(0, 1 << 32, self.used, np.uint32)
+        whole, half = divmod(self.used, 2)
+        self.bits.state = self.before | {"has_uint32": 1 - half, "uinteger": self.words[2 * whole]}
+        self.bits.random_raw(whole, output=False)
 
 
 class Level(NamedTuple):
     """What the generator decides at a reset, and for every further segment of an endless path."""
 
     path: list[int]  # its cells, from the origin to the goal
-    walls: list[int]  # the untraceable places of each segment
+    walls: list[int]  # the untraceable places of each segment, a bit set
 
 
 def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
@@ -293,7 +312,7 @@ def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Varian
         else:
             start, end = start * SIDE + near, end * SIDE + far
         walls = draw_walls(tape, start, end)
-        level = Level([CELLS[place] for place in draw_path(tape, walls, start, end)], [walls])
+        level = Level([CELLS[place] for place in draw_path(tape, walls, start, end)], [_bits(walls)])
     tape.close()
     return level
 
@@ -307,55 +326,58 @@ def draw_segments(tape: Tape, row: int, first: int, count: int) -> Level:
         shift = segment * SEGMENT * ROWS
         path += [CELLS[place] + shift for place in draw_path(tape, walls, start, end)]
         path.append(path[-1] + ROWS)  # the transition tile
-        every_wall.append(walls)
+        every_wall.append(_bits(walls))
         row = end % SIDE
     return Level(path, every_wall)
 
 
-def draw_walls(tape: Tape, start: int, end: int) -> int:
-    """A set of untraceable places: some inside, some on the border that touch neither those nor start and end.
+def draw_walls(tape: Tape, start: int, end: int) -> list[int]:
+    """Untraceable places: some inside, some on the border that touch neither those nor start and end.
 
     So there always is a path: along the border, and one ring further inside past the walls that stand there.
     """
-    walls, kept_free = 0, NEAR[start] | NEAR[end]
-    for (place, around), hit in zip(INSIDE, tape.chances(len(INSIDE)), strict=True):
-        if hit:
-            walls |= place
-            kept_free |= around
-    free = [place for place in BORDER if not place & kept_free]
+    hits = tape.chances(len(INSIDE))
+    (left, around_left), (right, around_right) = HALVES[0][hits & 255], HALVES[1][hits >> 8]
+    walls, kept_free = left + right, NEAR[start] | NEAR[end] | around_left | around_right
+    free = [place for place, bit in BORDER if not bit & kept_free]
     for _ in range((4, 8)[tape.below(2)]):
         if free:
-            walls |= free.pop(tape.below(len(free)))
+            walls.append(free.pop(tape.below(len(free))))
     return walls
 
 
-def draw_path(tape: Tape, walls: int, start: int, end: int) -> list[int]:
+def draw_path(tape: Tape, walls: list[int], start: int, end: int) -> list[int]:
     """The path that A* finds over random costs, not always the cheapest: its places from start to end."""
-    words, used, closed = tape.words, tape.used, walls
-    cost, total, previous = [0] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
-    distance, opened, here = DISTANCES[end], [], start
+    costs, used, distance = tape.costs, tape.used, DISTANCES[end]
+    cost, total, previous = [UNSEEN] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
+    for place in walls:
+        cost[place] = UNTRACEABLE
+    opened, first, here, so_far = [], None, start, 1
     while here != end:
-        closed |= 1 << here
-        so_far = cost[here] + 1
-        for place, bit in NEIGHBOURS[here]:
-            if closed & bit:
-                continue
-            there = so_far + (words[used] >> 29)  # a cost of 1 to 8
-            used += 1
-            if not cost[place]:
-                cost[place], total[place], previous[place] = there, there + distance[place], here
-                opened.append(place)
-            elif there < cost[place]:
-                # The original leaves the higher cost as it is.
-                previous[place] = here
+        cost[here] = UNTRACEABLE
+        for place in NEIGHBOURS[here]:
+            known = cost[place]
+            if known:
+                there = so_far + costs[used]  # a cost of 1 to 8
+                used += 1
+                if known == UNSEEN:
+                    cost[place], total[place], previous[place] = there, there + distance[place], here
+                    opened.append(place)
+                elif there < known:
+                    # The original leaves the higher cost as it is.
+                    previous[place] = here
         # Not the least total: the first that is less than the first of all, as in the original.
-        here = opened[0]
-        least = total[here]
-        for place in opened:
-            if total[place] < least:
-                here = place
+        if first is None:
+            waiting, dearer = iter(opened), []
+            first = next(waiting)
+            least = total[first]
+        for here in waiting:
+            if total[here] < least:
                 break
-        opened.remove(here)
+            dearer.append(here)
+        else:
+            here, first, opened = first, None, dearer
+        so_far = cost[here] + 1
     tape.used = used
     path = [end]
     while here != start:
