@@ -3,11 +3,11 @@
 Shape letters: N lanes, n some of them, M cells of the map, P steps of the path that fit, K of them drawn, S segments.
 """
 
-import functools
 import math
-import operator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
+from itertools import compress, product
+from operator import or_
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -215,56 +215,68 @@ def _neighbours(x: int, y: int, moves: tuple[tuple[int, int], ...]) -> list[int]
     return [spot[0] * SIDE + spot[1] for spot in spots if spot in PLACES]
 
 
-def _bits(places: list[int]) -> int:
-    return sum(1 << place for place in places)
-
-
 NEIGHBOURS = [_neighbours(x, y, STRAIGHT) for x, y in PLACES]
-NEAR = [_bits(_neighbours(x, y, ((0, 0), *STRAIGHT))) for x, y in PLACES]
-AROUND = [_bits(_neighbours(x, y, STRAIGHT + OBLIQUE)) for x, y in PLACES]
-INSIDE = [place for place, (x, y) in enumerate(PLACES) if 0 < x < SIDE - 2 and 0 < y < SIDE - 2]  # may become walls
-BORDER = [(place, 1 << place) for place, spot in enumerate(PLACES) if 0 in spot or SIDE - 1 in spot]
 DISTANCES = [[math.sqrt((a - x) ** 2 + (b - y) ** 2) for a, b in PLACES] for x, y in PLACES]
-UNTRACEABLE, UNSEEN = 0, 1 << 20  # in place of the cost of the way to a place
+
+# Places that may become walls. Of the border's, a set is an integer's bits, and eight of them are a look-up.
+INSIDE = [place for place, (x, y) in enumerate(PLACES) if 0 < x < SIDE - 2 and 0 < y < SIDE - 2]
+BORDER = [place for place, spot in enumerate(PLACES) if 0 in spot or SIDE - 1 in spot]
 
 
-def _hit(places: list[int]) -> list[tuple[list[int], int]]:
-    """By which of the places are hit, a bit each: those places, and a set, in bits, of them and those around."""
-    hits = [[place for at, place in enumerate(places) if bits >> at & 1] for bits in range(1 << len(places))]
-    return [(hit, functools.reduce(operator.or_, [AROUND[place] for place in hit], 0)) for hit in hits]
+def _border_bits(places: list[int]) -> int:
+    return sum(1 << at for at, place in enumerate(BORDER) if place in places)
 
 
-HALVES = [_hit(INSIDE[:8]), _hit(INSIDE[8:])]
+NEAR = [_border_bits(_neighbours(x, y, ((0, 0), *STRAIGHT))) for x, y in PLACES]
+AROUND = [_border_bits(_neighbours(x, y, STRAIGHT + OBLIQUE)) for x, y in PLACES]
+FREE = [[[BORDER[first + at] for at in range(8) if not kept >> at & 1] for kept in range(256)] for first in (0, 8, 16)]
+
+
+def _inner_walls(places: list[int]) -> dict[bytes, tuple[list[int], int]]:
+    """By which of eight places are hit, a byte each: those, and what is around them on the border."""
+    table = {}
+    for hits in product((0, 1), repeat=len(places)):
+        walls = list(compress(places, hits))
+        table[bytes(hits)] = walls, reduce(or_, [AROUND[place] for place in walls], 0)
+    return table
+
+
+INNER_WALLS = _inner_walls(INSIDE[:8]), _inner_walls(INSIDE[8:])
+CLOSED, UNREACHED = 0, 1 << 20  # in place of a cost
 
 WALLS = 33  # the chance of a wall in percent
 # In 32-bit words: below which one that is, and the few for which a number below 100 is drawn again.
 WALL_WORDS = -((-WALLS << 32) // 100)
 AGAIN = {word for part in range(100) if (word := -((-part << 32) // 100)) * 100 % (1 << 32) < (1 << 32) % 100}
 WORD = (1 << 32) - 1
+COSTS = bytes(byte >> 5 for byte in range(256))  # by a word's upper byte: a number below 8
 
 
 class Tape:
     """What a generator is about to draw, read ahead: a path takes dozens of numbers, and asking for each is slow.
 
-    All bounded integers are made of 32-bit words, the halves of the bit generator's 64-bit ones, the lower half first.
-    The generator is left as if it had drawn the used ones only.
+    All bounded integers are made of 32-bit words, which are the halves of the bit generator's 64-bit ones, the lower
+    half first. In the end, the generator goes back and draws those that were used.
 
-    Raises ValueError for a bit generator that has no such halves, as MT19937.
+    Raises ValueError for a bit generator without such halves, which MT19937 is.
     """
 
     def __init__(self, rng: np.random.Generator, paths: int):
         self.bits = rng.bit_generator
         self.before = self.bits.state
         if "has_uint32" not in self.before:
-            raise ValueError(f"the generator must be made of 64-bit words, as PCG64 is, not {self.before['bit_generator']}")
+            raise ValueError(f"a path needs a generator of 64-bit words, as PCG64, not {type(self.bits).__name__}")
         # A path takes 113 words at most, and one more for every number in ten million, which is drawn again.
-        words = np.empty(1 + 120 * paths, np.uint32)
-        # The first one is the upper half of the word before, which the generator keeps, used or not.
+        words = np.empty(1 + 120 * paths, "<u4")
+        # The generator keeps the upper half of the last word, used or not.
         words[0], words[1:] = self.before["uinteger"], self.bits.random_raw(60 * paths).view(np.uint32)
-        self.used = 1 - self.before["has_uint32"]
-        self.words = words.data
-        self.costs = (words >> 29).astype(np.uint8).tobytes()  # what below(8) makes of each
-        self.hits = int.from_bytes(np.packbits(words < WALL_WORDS, bitorder="little").tobytes(), "little")
+        self.load(words, 1 - self.before["has_uint32"])
+
+    def load(self, words: np.ndarray, used: int) -> None:
+        """Takes over the words, (n,) uint32, so many of which are used, and what most are drawn for."""
+        self.words, self.used = words.data, used
+        self.costs = words.tobytes()[3::4].translate(COSTS)  # what below(8) makes of each
+        self.hits = (words < WALL_WORDS).tobytes()
 
     def below(self, limit: int) -> int:
         """What Generator.integers(0, limit) would draw (Lemire's method)."""
@@ -272,22 +284,36 @@ class Tape:
             return 0
         product = self.words[self.used] * limit
         self.used += 1
-        if (product & WORD) < limit and (product & WORD) < (1 << 32) % limit:
+        if product & WORD < limit and product & WORD < (1 << 32) % limit:
             return self.below(limit)
         return product >> 32
 
-    def chances(self, count: int) -> int:
-        """Of so many numbers below 100, which are below WALLS: a bit each."""
-        if not AGAIN.isdisjoint(self.words[self.used : self.used + count]):
-            return sum((self.below(100) < WALLS) << at for at in range(count))
-        self.used += count
-        return self.hits >> (self.used - count) & ((1 << count) - 1)
+    def chances(self, count: int) -> bytes:
+        """Of so many numbers below 100, which are below WALLS."""
+        first, self.used = self.used, self.used + count
+        if AGAIN.isdisjoint(self.words[first : self.used].tolist()):
+            return self.hits[first : self.used]
+        self.used = first
+        return bytes([self.below(100) < WALLS for _ in range(count)])
+
+    def picks(self, things: list[int], count: int) -> list[int]:
+        """Takes so many out of the list, as many as there are: each time, things.pop(self.below(len(things)))."""
+        words, used, picked = self.words, self.used, []
+        for limit in range(len(things), max(len(things) - count, 1), -1):
+            product = words[used] * limit
+            used += 1
+            if product & WORD < limit:
+                self.used = used - 1
+                product, used = self.below(limit) << 32, self.used
+            picked.append(things.pop(product >> 32))
+        self.used = used
+        return picked if len(picked) == count else picked + things
 
     def close(self) -> None:
         """Leaves the generator as if it had drawn the used words only."""
         whole, half = divmod(self.used, 2)
         self.bits.state = self.before | {"has_uint32": 1 - half, "uinteger": self.words[2 * whole]}
-        self.bits.random_raw(whole, output=False)
+        self.bits.random_raw(whole)
 
 
 class Level(NamedTuple):
@@ -312,7 +338,7 @@ def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Varian
         else:
             start, end = start * SIDE + near, end * SIDE + far
         walls = draw_walls(tape, start, end)
-        level = Level([CELLS[place] for place in draw_path(tape, walls, start, end)], [_bits(walls)])
+        level = Level(trace(draw_path(tape, walls, start, end), 0), [bits_of(walls)])
     tape.close()
     return level
 
@@ -323,10 +349,9 @@ def draw_segments(tape: Tape, row: int, first: int, count: int) -> Level:
     for segment in range(first, first + count):
         start, end = row, (SIDE - 1) * SIDE + tape.below(SIDE)
         walls = draw_walls(tape, start, end)
-        shift = segment * SEGMENT * ROWS
-        path += [CELLS[place] + shift for place in draw_path(tape, walls, start, end)]
+        path += trace(draw_path(tape, walls, start, end), segment)
         path.append(path[-1] + ROWS)  # the transition tile
-        every_wall.append(_bits(walls))
+        every_wall.append(bits_of(walls))
         row = end % SIDE
     return Level(path, every_wall)
 
@@ -336,47 +361,46 @@ def draw_walls(tape: Tape, start: int, end: int) -> list[int]:
 
     So there always is a path: along the border, and one ring further inside past the walls that stand there.
     """
-    hits = tape.chances(len(INSIDE))
-    (left, around_left), (right, around_right) = HALVES[0][hits & 255], HALVES[1][hits >> 8]
-    walls, kept_free = left + right, NEAR[start] | NEAR[end] | around_left | around_right
-    free = [place for place, bit in BORDER if not bit & kept_free]
-    for _ in range((4, 8)[tape.below(2)]):
-        if free:
-            walls.append(free.pop(tape.below(len(free))))
-    return walls
+    inside, kept_free = [], NEAR[start] | NEAR[end]
+    for half in INNER_WALLS:
+        walls, around = half[tape.chances(8)]
+        inside += walls
+        kept_free |= around
+    free = FREE[0][kept_free & 255] + FREE[1][kept_free >> 8 & 255] + FREE[2][kept_free >> 16]
+    return inside + tape.picks(free, (4, 8)[tape.below(2)])
 
 
 def draw_path(tape: Tape, walls: list[int], start: int, end: int) -> list[int]:
     """The path that A* finds over random costs, not always the cheapest: its places from start to end."""
     costs, used, distance = tape.costs, tape.used, DISTANCES[end]
-    cost, total, previous = [UNSEEN] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
+    cost, total, previous = [UNREACHED] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
     for place in walls:
-        cost[place] = UNTRACEABLE
+        cost[place] = CLOSED
     opened, first, here, so_far = [], None, start, 1
     while here != end:
-        cost[here] = UNTRACEABLE
+        cost[here] = CLOSED
         for place in NEIGHBOURS[here]:
-            known = cost[place]
-            if known:
+            if cost[place]:
                 there = so_far + costs[used]  # a cost of 1 to 8
                 used += 1
-                if known == UNSEEN:
+                if cost[place] == UNREACHED:
                     cost[place], total[place], previous[place] = there, there + distance[place], here
                     opened.append(place)
-                elif there < known:
+                elif there < cost[place]:
                     # The original leaves the higher cost as it is.
                     previous[place] = here
-        # Not the least total: the first that is less than the first of all, as in the original.
+        # Next is not the least total, but as in the original the first in line that is less than that of the very
+        # first, else the very first. So no one needs to be compared with it twice.
         if first is None:
-            waiting, dearer = iter(opened), []
+            waiting, passed = iter(opened), []
             first = next(waiting)
             least = total[first]
         for here in waiting:
             if total[here] < least:
                 break
-            dearer.append(here)
+            passed.append(here)
         else:
-            here, first, opened = first, None, dearer
+            here, first, opened = first, None, passed
         so_far = cost[here] + 1
     tape.used = used
     path = [end]
@@ -384,6 +408,17 @@ def draw_path(tape: Tape, walls: list[int], start: int, end: int) -> list[int]:
         here = previous[here]
         path.append(here)
     return path[::-1]
+
+
+def trace(path: list[int], segment: int) -> list[int]:
+    """The map's cells of the path's places in this segment."""
+    shift = segment * SEGMENT * ROWS
+    return [CELLS[place] + shift for place in path]
+
+
+def bits_of(places: list[int]) -> int:
+    """The places as a set of bits."""
+    return sum([1 << place for place in places])
 
 
 def write_level(s: State, lane: int, level: Level, values: dict[str, Any], variant: Variant) -> None:
