@@ -4,10 +4,9 @@ Shape letters: N lanes, n some of them, M cells of the map, P steps of the path 
 """
 
 import math
+import sys
 from dataclasses import dataclass
-from functools import cache, reduce
-from itertools import compress, product
-from operator import or_
+from functools import cache
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -43,12 +42,13 @@ MAP_STRIDES = np.array([ROWS, 1])
 PIT = 0  # the step of the path at places that are none; the path's own steps count from 1, the origin
 NOWHERE = -1  # the cell of that step
 NO_STEP = -1  # where an agent is while it is put back
+REACHED = -1  # of steps without a reward for reaching them first
 TILE_AT = (np.arange(SPAN) - PAD) // TILE  # of stored positions on the screen
 BRANCHES = np.array([3, 1])  # numbers the actions of two branches
 
 EAST, NORTH, SOUTH, WEST = range(4)
-HEADINGS = np.zeros(2 * ROWS + 1, np.int64)  # by ROWS + the difference of two cells
-HEADINGS[[ROWS + ROWS, ROWS - 1, ROWS + 1, ROWS - ROWS]] = EAST, NORTH, SOUTH, WEST
+HEADINGS = np.zeros(2 * ROWS + 1, np.int64)  # by the difference of two cells, counted from the end if negative
+HEADINGS[[ROWS, -1, 1, -ROWS]] = EAST, NORTH, SOUTH, WEST
 
 
 # ---- configuration ----
@@ -122,8 +122,7 @@ class State:
     count: np.ndarray  # (N,) steps of the path; the last one is the goal
     cell: np.ndarray  # (N, P) where each step of the path is, NOWHERE at first
     heading_at: np.ndarray  # (N, P) uint8: the direction of the next step
-    fresh: np.ndarray  # (N, P) bool: the step has a reward for reaching it
-    restful: np.ndarray  # (N, P) bool: the step gives stamina back
+    reached: np.ndarray  # (N, P) 1 + how often the agent had fallen off when it last was there; 0: never; or REACHED
     step_at: np.ndarray  # (N, M) the inverse of cell: the step of the path that is there, or PIT
     past: np.ndarray  # (N,) bool: something of the path behind the agent is shown
     trail_lane: np.ndarray  # (m,) the lane of each tile of the path that is shown behind any agent
@@ -131,7 +130,7 @@ class State:
     trail_y: np.ndarray  # (m,)
     hurt: np.ndarray  # (N,) bool: in the pit, and a cross shows it
     known: np.ndarray  # (N, M) bool: the agent fell off there before
-    walls: np.ndarray  # (N, S) each segment's untraceable places, a bit set
+    walls: np.ndarray  # (N,) object: the untraceable places of each segment, a list of lists
     segments: np.ndarray  # (N,)
     furthest: np.ndarray  # (N,) the rightmost column of the path reached so far
     stamina: np.ndarray  # (N,) steps left to reach another tile
@@ -165,11 +164,11 @@ def empty_state(lanes: int, segments: int) -> State:
     """The state of N lanes before their first reset, with room for this many segments."""
     steps, cells = (SIDE * SIDE + 1,), (segments * SEGMENT * ROWS,)
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("pos", "origin", "tile"), (2,))
-    shapes |= {"walls": (segments,), "speed": (1,), "step_at": cells, "known": cells}
-    shapes |= dict.fromkeys(("cell", "heading_at", "fresh", "restful"), steps)
-    flags = ("fallen", "past", "hurt", "fresh", "restful", "known", "extras", "feedback")
+    shapes |= {"speed": (1,), "step_at": cells, "known": cells}
+    shapes |= dict.fromkeys(("cell", "heading_at", "reached"), steps)
+    flags = ("fallen", "past", "hurt", "known", "extras", "feedback")
     kinds: dict[str, Any] = dict.fromkeys((*flags, *(f"show_{what}" for what in SHOWN)), bool)
-    kinds |= dict.fromkeys(("returned", "camera"), np.float64) | {"heading_at": np.uint8}
+    kinds |= dict.fromkeys(("returned", "camera"), np.float64) | {"heading_at": np.uint8, "walls": object}
     kinds |= dict.fromkeys(("reward_goal", "reward_fall_off", "reward_progress", "reward_step"), np.float64)
     names = State.__dataclass_fields__
     s = State(**{name: np.zeros((lanes, *shapes.get(name, ())), kinds.get(name, np.int64)) for name in names})
@@ -189,15 +188,15 @@ SHOWN = {
 
 def make_room(s: State, steps: int, segments: int) -> bool:
     """Widens the state if it cannot hold a path of so many steps and segments; whether it had to."""
-    if steps < s.cell.shape[1] and segments <= s.walls.shape[1]:
+    room = s.known.shape[1] // (SEGMENT * ROWS)
+    if steps < s.cell.shape[1] and segments <= room:
         return False
     # By half as much again at least, so that an ever longer path seldom has to move.
-    steps, segments = max(steps + 1, s.cell.shape[1] * 3 // 2), max(segments, s.walls.shape[1] * 3 // 2)
-    for name in ("cell", "heading_at", "fresh", "restful"):
+    steps, segments = max(steps + 1, s.cell.shape[1] * 3 // 2), max(segments, room * 3 // 2)
+    for name in ("cell", "heading_at", "reached"):
         setattr(s, name, widened(getattr(s, name), steps))
     for name in ("step_at", "known"):
         setattr(s, name, widened(getattr(s, name), segments * SEGMENT * ROWS))
-    s.walls = widened(s.walls, segments)
     return True
 
 
@@ -230,18 +229,6 @@ def _border_bits(places: list[int]) -> int:
 NEAR = [_border_bits(_neighbours(x, y, ((0, 0), *STRAIGHT))) for x, y in PLACES]
 AROUND = [_border_bits(_neighbours(x, y, STRAIGHT + OBLIQUE)) for x, y in PLACES]
 FREE = [[[BORDER[first + at] for at in range(8) if not kept >> at & 1] for kept in range(256)] for first in (0, 8, 16)]
-
-
-def _inner_walls(places: list[int]) -> dict[bytes, tuple[list[int], int]]:
-    """By which of eight places are hit, a byte each: those, and what is around them on the border."""
-    table = {}
-    for hits in product((0, 1), repeat=len(places)):
-        walls = list(compress(places, hits))
-        table[bytes(hits)] = walls, reduce(or_, [AROUND[place] for place in walls], 0)
-    return table
-
-
-INNER_WALLS = _inner_walls(INSIDE[:8]), _inner_walls(INSIDE[8:])
 CLOSED, UNREACHED = 0, 1 << 20  # in place of a cost
 
 WALLS = 33  # the chance of a wall in percent
@@ -263,20 +250,18 @@ class Tape:
 
     def __init__(self, rng: np.random.Generator, paths: int):
         self.bits = rng.bit_generator
-        self.before = self.bits.state
-        if "has_uint32" not in self.before:
+        self.state = self.bits.state
+        if "has_uint32" not in self.state:
             raise ValueError(f"a path needs a generator of 64-bit words, as PCG64, not {type(self.bits).__name__}")
+        # The generator keeps the upper half of its last word, used or not.
+        kept, self.used = self.state["uinteger"].to_bytes(4, sys.byteorder), 1 - self.state["has_uint32"]
         # A path takes 113 words at most, and one more for every number in ten million, which is drawn again.
-        words = np.empty(1 + 120 * paths, "<u4")
-        # The generator keeps the upper half of the last word, used or not.
-        words[0], words[1:] = self.before["uinteger"], self.bits.random_raw(60 * paths).view(np.uint32)
-        self.load(words, 1 - self.before["has_uint32"])
+        self.load(kept + self.bits.random_raw(60 * paths).tobytes())
 
-    def load(self, words: np.ndarray, used: int) -> None:
-        """Takes over the words, (n,) uint32, so many of which are used, and what most are drawn for."""
-        self.words, self.used = words.data, used
-        self.costs = words.tobytes()[3::4].translate(COSTS)  # what below(8) makes of each
-        self.hits = (words < WALL_WORDS).tobytes()
+    def load(self, words: bytes) -> None:
+        """Takes over the words."""
+        self.words = memoryview(words).cast("I")
+        self.costs = words[3::4].translate(COSTS)  # what below(8) makes of each
 
     def below(self, limit: int) -> int:
         """What Generator.integers(0, limit) would draw (Lemire's method)."""
@@ -288,13 +273,13 @@ class Tape:
             return self.below(limit)
         return product >> 32
 
-    def chances(self, count: int) -> bytes:
-        """Of so many numbers below 100, which are below WALLS."""
-        first, self.used = self.used, self.used + count
-        if AGAIN.isdisjoint(self.words[first : self.used].tolist()):
-            return self.hits[first : self.used]
-        self.used = first
-        return bytes([self.below(100) < WALLS for _ in range(count)])
+    def hits(self, things: list[int]) -> list[int]:
+        """Of the things, for each of which a number below 100 is drawn, those where it is below WALLS."""
+        words = self.words[self.used : self.used + len(things)].tolist()
+        if not AGAIN.isdisjoint(words):
+            return [thing for thing in things if self.below(100) < WALLS]
+        self.used += len(things)
+        return [thing for thing, word in zip(things, words, strict=True) if word < WALL_WORDS]
 
     def picks(self, things: list[int], count: int) -> list[int]:
         """Takes so many out of the list, as many as there are: each time, things.pop(self.below(len(things)))."""
@@ -312,7 +297,8 @@ class Tape:
     def close(self) -> None:
         """Leaves the generator as if it had drawn the used words only."""
         whole, half = divmod(self.used, 2)
-        self.bits.state = self.before | {"has_uint32": 1 - half, "uinteger": self.words[2 * whole]}
+        self.state["has_uint32"], self.state["uinteger"] = 1 - half, self.words[2 * whole]
+        self.bits.state = self.state
         self.bits.random_raw(whole)
 
 
@@ -320,7 +306,7 @@ class Level(NamedTuple):
     """What the generator decides at a reset, and for every further segment of an endless path."""
 
     path: list[int]  # its cells, from the origin to the goal
-    walls: list[int]  # the untraceable places of each segment, a bit set
+    walls: list[list[int]]  # the untraceable places of each segment
 
 
 def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
@@ -338,7 +324,7 @@ def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Varian
         else:
             start, end = start * SIDE + near, end * SIDE + far
         walls = draw_walls(tape, start, end)
-        level = Level(trace(draw_path(tape, walls, start, end), 0), [bits_of(walls)])
+        level = Level(cells_of(draw_path(tape, walls, start, end), 0), [walls])
     tape.close()
     return level
 
@@ -349,9 +335,9 @@ def draw_segments(tape: Tape, row: int, first: int, count: int) -> Level:
     for segment in range(first, first + count):
         start, end = row, (SIDE - 1) * SIDE + tape.below(SIDE)
         walls = draw_walls(tape, start, end)
-        path += trace(draw_path(tape, walls, start, end), segment)
+        path += cells_of(draw_path(tape, walls, start, end), segment)
         path.append(path[-1] + ROWS)  # the transition tile
-        every_wall.append(bits_of(walls))
+        every_wall.append(walls)
         row = end % SIDE
     return Level(path, every_wall)
 
@@ -361,13 +347,11 @@ def draw_walls(tape: Tape, start: int, end: int) -> list[int]:
 
     So there always is a path: along the border, and one ring further inside past the walls that stand there.
     """
-    inside, kept_free = [], NEAR[start] | NEAR[end]
-    for half in INNER_WALLS:
-        walls, around = half[tape.chances(8)]
-        inside += walls
-        kept_free |= around
+    walls, kept_free = tape.hits(INSIDE), NEAR[start] | NEAR[end]
+    for place in walls:
+        kept_free |= AROUND[place]
     free = FREE[0][kept_free & 255] + FREE[1][kept_free >> 8 & 255] + FREE[2][kept_free >> 16]
-    return inside + tape.picks(free, (4, 8)[tape.below(2)])
+    return walls + tape.picks(free, (4, 8)[tape.below(2)])
 
 
 def draw_path(tape: Tape, walls: list[int], start: int, end: int) -> list[int]:
@@ -410,29 +394,28 @@ def draw_path(tape: Tape, walls: list[int], start: int, end: int) -> list[int]:
     return path[::-1]
 
 
-def trace(path: list[int], segment: int) -> list[int]:
-    """The map's cells of the path's places in this segment."""
+def cells_of(places: list[int], segment: int) -> list[int]:
+    """The map's cells of this segment's places."""
     shift = segment * SEGMENT * ROWS
-    return [CELLS[place] + shift for place in path]
-
-
-def bits_of(places: list[int]) -> int:
-    """The places as a set of bits."""
-    return sum([1 << place for place in places])
+    return [CELLS[place] + shift for place in places]
 
 
 def write_level(s: State, lane: int, level: Level, values: dict[str, Any], variant: Variant) -> None:
     """Starts the lane's episode at this level."""
     s.step_at[lane] = PIT
-    s.known[lane] = s.fallen[lane] = s.hurt[lane] = s.fresh[lane] = s.restful[lane] = False
+    s.known[lane] = s.fallen[lane] = s.hurt[lane] = False
     if s.past[lane]:
         s.past[lane] = False
         others = s.trail_lane != lane
         s.trail_lane, s.trail_x, s.trail_y = s.trail_lane[others], s.trail_x[others], s.trail_y[others]
     s.count[lane] = s.segments[lane] = s.furthest[lane] = s.fails[lane] = s.visited[lane] = 0
     s.length[lane] = s.returned[lane] = 0
+    s.walls[lane] = []
     write_path(s, lane, level, variant)
-    s.fresh[lane, 1] = False
+    s.reached[lane] = 0
+    s.reached[lane, PIT] = s.reached[lane, 1] = REACHED
+    if not variant.endless:
+        s.reached[lane, len(level.path)] = REACHED  # the goal has a reward of its own
     radius = radius_of(0.25 if variant.grid else values["agent_scale"])
     for axis, start in enumerate(divmod(level.path[0] - BEYOND, ROWS)):
         # Not the tile's middle but for the default size, as in the original.
@@ -446,20 +429,17 @@ def write_level(s: State, lane: int, level: Level, values: dict[str, Any], varia
 
 def write_path(s: State, lane: int, level: Level, variant: Variant) -> None:
     """Appends to the lane's path, for which there must be room."""
-    first, segment = int(s.count[lane]) + 1, int(s.segments[lane])
-    last, path = first + len(level.path), np.array(level.path)
-    s.cell[lane, first:last] = path
-    s.step_at[lane, path] = np.arange(first, last)
-    headings = HEADINGS.take(path[1:] - path[:-1] + ROWS)
-    s.heading_at[lane, first : last - 1] = headings
+    first = int(s.count[lane]) + 1
+    last = first + len(level.path)
+    s.cell[lane, first:last] = level.path
+    path = s.cell[lane, first:last]
+    s.step_at[lane][path] = np.arange(first, last)
+    s.heading_at[lane, first : last - 1] = HEADINGS[path[1:] - path[:-1]]
     # Behind a transition tile the path goes on to the right. The goal has the direction that leads to it.
-    s.heading_at[lane, last - 1] = EAST if variant.endless else headings[-1]
-    s.fresh[lane, first:last] = s.restful[lane, first:last] = True
-    s.walls[lane, segment : segment + len(level.walls)] = level.walls
+    s.heading_at[lane, last - 1] = EAST if variant.endless else s.heading_at[lane, last - 2]
     s.count[lane] = last - 1
-    s.segments[lane] = segment + len(level.walls)
-    if not variant.endless:
-        s.fresh[lane, last - 1] = False  # the goal has a reward of its own
+    s.segments[lane] += len(level.walls)
+    s.walls[lane] += level.walls
 
 
 # ---- drawing ----
@@ -613,12 +593,16 @@ def land(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: bool) ->
     lane_path: (N,) where the lane's steps start in the flattened path. rewards: (N,), changed in place.
     """
     s.at = np.where(s.fallen, s.at, s.step)
-    here = s.step + lane_path
-    fresh = s.fresh.take(here)
+    here, now = s.step + lane_path, s.fails + 1
+    before = s.reached.take(here)
+    fresh = before == 0
     if np.count_nonzero(fresh):
         rewards += fresh * s.reward_progress
         s.visited += fresh
-        s.fresh.put(here, False)
+    if endless:
+        # The first time since the last fall, a tile gives stamina back. So does the origin.
+        np.copyto(s.stamina, s.stamina_level, where=before != now)
+    s.reached.put(here, now)
     if np.count_nonzero(s.fallen):
         rewards += s.fallen * s.reward_fall_off
         s.fails += s.fallen
@@ -628,53 +612,42 @@ def land(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: bool) ->
         # The ground truth has no entry for the west.
         heading = np.where(heading == WEST, s.heading, heading)
         s.past = s.show_past & (np.minimum(s.tile[:, 0], s.at - 1) > 0)
-        follow(s)
+        follow(s, lane_path)
     s.heading = heading
 
 
-def follow(s: State) -> None:
+def follow(s: State, lane_path: np.ndarray) -> None:
     """Finds the path behind the agents that is shown."""
     (lanes,) = s.past.nonzero()
     if lanes.size:
-        owner, cell = trail(s, lanes)
+        s.trail_lane, cell = trail(s, lanes, lane_path)
         column, row = np.divmod(cell, ROWS)
-        s.trail_lane, s.trail_x, s.trail_y = lanes[owner], column * TILE, (row - BEYOND) * TILE
+        s.trail_x, s.trail_y = column * TILE, (row - BEYOND) * TILE
 
 
-def trail(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The path behind the agents: for each tile, (m,), which of the lanes it belongs to, and its cell.
+def trail(s: State, lanes: np.ndarray, lane_path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The path behind the agents of the lanes: for each tile, (m,), its lane and its cell.
 
     From the last step but one backwards, up to the first that is as far to the left as the camera's offset in tiles.
     """
-    at = s.at[lanes]
-    bound = np.maximum(s.tile[lanes, 0] - s.depth[lanes], 1) * ROWS  # (n,) cells below that are far enough left
+    at = s.at.take(lanes)
+    bound = np.maximum(s.tile[:, 0] - s.depth, 1).take(lanes) * ROWS  # (n,) cells below that are far enough left
     back = BACK[: int(at.max())]  # (K,)
-    steps = at[:, None] - back  # (n, K)
-    np.maximum(steps, PIT, out=steps)
-    cells = s.cell.take(steps + lanes[:, None] * s.cell.shape[1])  # (n, K)
-    # At the latest, a trail ends at the pit, whose cell is left of everything.
-    last = (cells < bound[:, None]).argmax(axis=1)  # (n,)
-    owner, which = np.nonzero((back <= last[:, None] + 1) & (cells != NOWHERE))
-    return owner, cells[owner, which]
-
-
-def rest(s: State, lane_path: np.ndarray) -> None:
-    """The endless id: gives stamina back on a tile for the first time since the last fall. So does the origin."""
-    here = s.step + lane_path
-    np.copyto(s.stamina, s.stamina_level, where=s.restful.take(here))
-    s.restful.put(here, False)
+    # What is before the pit is of another lane, but nobody gets there: the pit's cell is left of everything.
+    cells = s.cell.take((at + lane_path.take(lanes))[:, None] - back)  # (n, K)
+    count = (cells < bound[:, None]).argmax(axis=1) + 1  # (n,)
+    np.minimum(count, at - 1, out=count)
+    return lanes.repeat(count), cells[back <= count[:, None]]
 
 
 def fall(s: State, cell: np.ndarray) -> np.ndarray:
-    """The endless id: gives stamina back to those in the pit; (N,) bool whose fall ends the episode.
+    """The endless id: who fell off where the episode ends, (N,) bool.
 
     cell: (N,) the agents' places in the flattened map.
     """
     over = s.fallen & ((s.tile[:, 0] < s.furthest) | s.known.take(cell))
     # Never forgotten: the original means to, on progress, but compares before there can be any.
     s.known.put(cell[s.fallen], True)
-    s.restful[s.fallen, 1:] = True
-    np.copyto(s.stamina, s.stamina_level, where=s.fallen)
     return over
 
 
@@ -816,7 +789,6 @@ class MysteryPath(MemoryGymVectorEnv):
         if not landed:
             s.stamina -= 1
             return s.stamina == 0
-        rest(s, self._lane_path)
         over = fall(s, cell) if np.count_nonzero(s.fallen) else False
         s.furthest = np.where(s.fallen, s.furthest, np.maximum(s.furthest, s.tile[:, 0]))
         s.stamina -= 1
@@ -879,9 +851,8 @@ class MysteryPath(MemoryGymVectorEnv):
         marks[0] = (marks[0][0], ORIGIN)
         if not endless:
             marks[-1] = (marks[-1][0], GOAL)
-        for segment, walls in enumerate(s.walls[lane, : s.segments[lane]].tolist()):
-            shift = segment * SEGMENT * ROWS
-            marks += [(CELLS[place] + shift, WALL) for place in range(SIDE * SIDE) if walls >> place & 1]
+        for segment, walls in enumerate(s.walls[lane]):
+            marks += [(cell, WALL) for cell in cells_of(walls, segment)]
         camera = int(s.pos[lane, 0] - s.origin[lane, 0] - s.camera[lane]) if endless else 0
         for cell, kind in marks:
             centre = tile_centres(np.array([cell])) - (camera, 0)

@@ -63,7 +63,7 @@ def test_paths_lead_to_the_opposite_side(env_id, side):
         assert (path[0][axis], path[-1][axis]) == (near, SIDE - 1 - near)
         assert all(0 <= x < SIDE and 0 <= y < SIDE for x, y in path)
         check_path(s, path)
-        assert not any(s.walls[0, 0] >> (x * SIDE + y) & 1 for x, y in path)
+        assert not any(x * SIDE + y in s.walls[0][0] for x, y in path)
         ends.add((path[0], path[-1]))
         lengths.add(len(path))
     assert len(ends) > 20
@@ -337,14 +337,14 @@ def test_past_path(camera):
         lanes = np.flatnonzero(s.tile[:, 0] > 0)
         if not lanes.size:
             continue
-        owner, cells = trail(s, lanes)
-        for index, lane in enumerate(lanes.tolist()):
+        owner, cells = trail(s, lanes, envs._lane_path)
+        for lane in lanes.tolist():
             expected, left = [], max(0, int(s.tile[lane, 0]) - 1 - int(camera))
             for step in range(int(s.at[lane]) - 1, 0, -1):
                 expected.append(int(s.cell[lane, step]))
                 if expected[-1] // ROWS <= left:
                     break
-            assert cells[owner == index].tolist() == expected
+            assert cells[owner == lane].tolist() == expected
             drawn, longest = drawn + len(expected), max(longest, len(expected))
     assert drawn > 300
     assert longest > camera + 1
@@ -381,8 +381,8 @@ def test_debug_render_shows_the_path(env_id):
         offset = s.pos[0, 0] - s.origin[0, 0] - 60 if endless else 0
         path = path_of(s)
         kinds = dict.fromkeys(path, WHITE) | {path[0]: BLUE} | ({} if endless else {path[-1]: GREEN})
-        for segment, walls in enumerate(s.walls[0, : s.segments[0]].tolist()):
-            places = [divmod(place, SIDE) for place in range(SIDE * SIDE) if walls >> place & 1]
+        for segment, walls in enumerate(s.walls[0]):
+            places = [divmod(place, SIDE) for place in walls]
             kinds |= {(column + SEGMENT * segment, row): RED for column, row in places}
         shown = 0
         for (column, row), color in kinds.items():
