@@ -121,10 +121,10 @@ class State:
     fallen: np.ndarray  # (N,) bool: in the pit, and so put back at the next step
     count: np.ndarray  # (N,) steps of the path; the last one is the goal
     cell: np.ndarray  # (N, P) where each step of the path is, NOWHERE at first
-    heading_at: np.ndarray  # (N, P) uint8: the direction of the next step
+    heading_at: np.ndarray  # (N, P) the direction of the next step
     reached: np.ndarray  # (N, P) 1 + how often the agent had fallen off when it last was there; 0: never; or REACHED
     step_at: np.ndarray  # (N, M) the inverse of cell: the step of the path that is there, or PIT
-    past: np.ndarray  # (N,) bool: something of the path behind the agent is shown
+    past: np.ndarray  # (N,) bool: the path behind the agent, if there is any, is shown
     trail_lane: np.ndarray  # (m,) the lane of each tile of the path that is shown behind any agent
     trail_x: np.ndarray  # (m,) its first pixel, counted along the path
     trail_y: np.ndarray  # (m,)
@@ -168,7 +168,7 @@ def empty_state(lanes: int, segments: int) -> State:
     shapes |= dict.fromkeys(("cell", "heading_at", "reached"), steps)
     flags = ("fallen", "past", "hurt", "known", "extras", "feedback")
     kinds: dict[str, Any] = dict.fromkeys((*flags, *(f"show_{what}" for what in SHOWN)), bool)
-    kinds |= dict.fromkeys(("returned", "camera"), np.float64) | {"heading_at": np.uint8, "walls": object}
+    kinds |= dict.fromkeys(("returned", "camera"), np.float64) | {"walls": object}
     kinds |= dict.fromkeys(("reward_goal", "reward_fall_off", "reward_progress", "reward_step"), np.float64)
     names = State.__dataclass_fields__
     s = State(**{name: np.zeros((lanes, *shapes.get(name, ())), kinds.get(name, np.int64)) for name in names})
@@ -610,8 +610,8 @@ def land(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: bool) ->
     heading = s.heading_at.take(s.at + lane_path)
     if endless:
         # The ground truth has no entry for the west.
-        heading = np.where(heading == WEST, s.heading, heading)
-        s.past = s.show_past & (np.minimum(s.tile[:, 0], s.at - 1) > 0)
+        np.copyto(heading, s.heading, where=heading == WEST)
+        s.past = s.show_past & (s.tile[:, 0] > 0)
         follow(s, lane_path)
     s.heading = heading
 
