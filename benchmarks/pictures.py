@@ -4,13 +4,27 @@ python benchmarks/pictures.py docs
 """
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from PIL import Image
 
 import memory_gym_envs  # noqa: F401 (registers the ids)
+
+RED = (255, 0, 0)
+
+
+class Moment(NamedTuple):
+    """An episode after so many steps."""
+
+    step: int
+    observation: np.ndarray  # (84, 84, 3)
+    truth: np.ndarray  # the id's ground truth
+    returned: float  # sum of rewards so far
+    picture: np.ndarray  # the agent's view above the debug view, both 336 pixels wide
 
 
 def joined(pictures: list[np.ndarray], axis: int, gap: int = 8) -> np.ndarray:
@@ -21,31 +35,79 @@ def joined(pictures: list[np.ndarray], axis: int, gap: int = 8) -> np.ndarray:
     return np.concatenate([part for picture in pictures for part in (white, picture)][1:], axis)
 
 
-def column(env: gym.Env, observation: np.ndarray) -> np.ndarray:
-    """Return the agent's view above the debug view, both 336 pixels wide."""
-    return joined([observation.repeat(4, axis=0).repeat(4, axis=1), env.render()], axis=0)
+def episode(env_id: str, seed: int, act: Callable[[Moment], np.ndarray], steps: int = 1000, **options) -> list[Moment]:
+    """Play an episode, or as many steps of it, and return all its moments."""
+    env = gym.make(env_id, render_mode="debug_rgb_array")
+    observation, info = env.reset(seed=seed, options=options)
+    moments, returned, done = [], 0.0, False
+    while True:
+        picture = joined([observation.repeat(4, axis=0).repeat(4, axis=1), env.render()], axis=0)
+        moments.append(Moment(len(moments), observation, info["ground_truth"], returned, picture))
+        if done or len(moments) > steps:
+            return moments
+        observation, reward, terminated, truncated, info = env.step(act(moments[-1]))
+        returned, done = returned + reward, terminated or truncated
 
 
-def mortar_mayhem(seed: int = 3) -> np.ndarray:
+def first(moments: list[Moment], condition: Callable[[Moment], bool]) -> Moment:
+    """Return the first moment for which the condition holds."""
+    return next(moment for moment in moments if condition(moment))
+
+
+def shows(color: tuple[int, int, int]) -> Callable[[Moment], bool]:
+    """Return the condition that the agent sees the color, below the top bar of Searing Spotlights."""
+    return lambda moment: bool((moment.observation[4:] == color).all(axis=-1).any())
+
+
+def towards(away: np.ndarray) -> np.ndarray:
+    """Return the action of free movement that goes there, for a distance in pixels along x and y."""
+    return np.where(np.abs(away) <= 2, 0, np.where(away > 0, 2, 1))
+
+
+def mortar_mayhem() -> list[Moment]:
     """Return four moments: a command is shown, the agent walks, the right tile stays blue, it stands on a wrong one."""
-    env = gym.make("MortarMayhem-v0", render_mode="debug_rgb_array")
-    observation, info = env.reset(seed=seed, options={"command_count": [2]})
-    columns, rewarded = [column(env, observation)], False
-    for step in range(1000):
-        target = info["ground_truth"] * 4  # the target's tile, for an arena of five
-        centre = (target * 14 + 14).astype(int)
-        agent = np.argwhere((observation == (250, 204, 153)).all(-1)).mean(0)[::-1]
-        walk = np.where(np.abs(centre - agent) <= 2, 0, np.where(centre > agent, 2, 1))
+
+    def act(moment: Moment) -> np.ndarray:
+        agent = np.argwhere((moment.observation == (250, 204, 153)).all(-1)).mean(0)[::-1]
+        target = (moment.truth * 4 * 14 + 14).astype(int)  # of an arena of five
         # After the first command it stays where it is, and so fails the second.
-        observation, reward, done, _, info = env.step(walk if not rewarded else np.zeros(2, int))
-        if step == 12 or reward > 0 or done:
-            columns.append(column(env, observation))
-        rewarded |= reward > 0
-        if done:
-            break
-    return joined(columns, axis=1)
+        return np.zeros(2, int) if moment.returned else towards(target - agent)
+
+    moments = episode("MortarMayhem-v0", 3, act, command_count=[2])
+    return [moments[0], moments[13], first(moments, lambda moment: moment.returned > 0), moments[-1]]
+
+
+def mystery_path() -> list[Moment]:
+    """Return four moments: at the path's origin, on the way, falling off; endless, with the path so far behind it."""
+    ways = np.array([(2, 0), (0, 1), (0, 2), (1, 0)])  # east, north, south, west
+
+    def act(moment: Moment) -> np.ndarray:
+        way = moment.truth.argmax()
+        return ways[way if moment.step < 24 else way ^ 1]  # later to the side, south instead of west
+
+    moments = episode("MysteryPath-v0", 5, act)
+    endless = episode("Endless-MysteryPath-v0", 3, lambda moment: 1 + moment.truth.argmax(), 60)
+    return [moments[0], moments[24], first(moments, shows(RED)), endless[-1]]
+
+
+def searing_spotlights() -> list[Moment]:
+    """Return four moments: the light goes out, the dark, a spotlight hits the agent; endless, with a new coin."""
+
+    def act(moment: Moment) -> np.ndarray:
+        agent, *things = moment.truth.reshape(-1, 2) * 84
+        return towards(next(thing for thing in things if thing.any()) - agent)
+
+    moments = episode("SearingSpotlights-v0", 41, act)
+    endless = episode("Endless-SearingSpotlights-v0", 8, act, 52)
+    return [moments[3], moments[18], first(moments, shows(RED)), endless[-1]]
+
+
+def write(folder: Path) -> None:
+    """Write one picture for each family."""
+    for family in (mortar_mayhem, mystery_path, searing_spotlights):
+        picture = joined([moment.picture for moment in family()], axis=1)
+        Image.fromarray(picture).save(folder / f"{family.__name__}.png", optimize=True)
 
 
 if __name__ == "__main__":
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "docs")
-    Image.fromarray(mortar_mayhem()).save(folder / "mortar_mayhem.png", optimize=True)
+    write(Path(sys.argv[1] if len(sys.argv) > 1 else "docs"))

@@ -6,6 +6,7 @@ Shape letters: N lanes (parallel environments), n some of them, G entries of the
 observation.
 """
 
+import math
 import operator
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -18,7 +19,7 @@ from gymnasium.vector.utils import batch_space
 
 from memory_gym_envs.drawing import magnify
 from memory_gym_envs.entries import vector_space
-from memory_gym_envs.options import resolve
+from memory_gym_envs.options import brief, resolve
 
 RENDER_MODES = ("rgb_array", "debug_rgb_array")
 OBS_TYPES = ("pixels", "vector")
@@ -74,7 +75,7 @@ class MemoryGymVectorEnv(VectorEnv):
         if obs_type not in OBS_TYPES:
             raise ValueError(f"obs_type must be {' or '.join(map(repr, OBS_TYPES))}, not {obs_type!r}")
         self.num_envs = _integer("num_envs", num_envs, 1)
-        self.num_levels = _integer("num_levels", num_levels or 0, 0)
+        self.num_levels = _integer("num_levels", 0 if num_levels is None else num_levels, 0, NO_LIMIT)
         self.start_level = _integer("start_level", start_level, 0)
         self.variant_id, self.variant, self.render_mode = variant, self.variants[variant], render_mode
         self.metadata = {**type(self).metadata, "render_fps": self.variant.render_fps}
@@ -175,7 +176,7 @@ class MemoryGymVectorEnv(VectorEnv):
             infos = self._final_info(ended, observations)
             for lane in ended.tolist():
                 self._next_level(lane, None)
-            _overwrite(observations, ended, self.observe(ended))
+            overwrite(observations, ended, self.observe(ended))
         infos.update(self._truth_info(None))
         return observations, rewards, terminated, truncated, infos
 
@@ -252,22 +253,19 @@ class MemoryGymVectorEnv(VectorEnv):
 
     def checked_actions(self, actions: Any) -> np.ndarray:
         """The actions as int64, or a ValueError that says what they must be."""
-        try:
-            array = np.asarray(actions)
-        except ValueError:  # rows of different lengths
-            array = np.asarray(None)
+        array = _array(actions)
         if array.shape == self._action_shape and array.dtype.kind in "iu":
             array = array.astype(np.int64, copy=False)
             # Negative numbers are huge as unsigned ones, so one comparison checks both ends.
             if not np.count_nonzero(array.view(np.uint64) >= self._action_count):
                 return array
         limit = f"integers from 0 to {self._action_count - 1} of shape {self._action_shape}"
-        raise ValueError(f"{self.variant_id}: actions must be {limit}, not {_brief(actions)}")
+        raise ValueError(f"{self.variant_id}: actions must be {limit}, not {brief(actions)}")
 
     def _split_mask(self, options: Mapping[str, Any] | None) -> tuple[np.ndarray, Mapping[str, Any] | None]:
         if not isinstance(options, Mapping) or "reset_mask" not in options:
             return np.arange(self.num_envs), options
-        mask = np.asarray(options["reset_mask"])
+        mask = _array(options["reset_mask"])
         if mask.dtype != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
             raise ValueError(f"reset_mask must be a bool array of shape ({self.num_envs},) with at least one True")
         if not self.ready and not mask.all():
@@ -277,7 +275,7 @@ class MemoryGymVectorEnv(VectorEnv):
     def _lane_seeds(self, seed: Any) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        if isinstance(seed, (list, tuple, np.ndarray)):
+        if isinstance(seed, (list, tuple)) or (isinstance(seed, np.ndarray) and seed.ndim):
             if len(seed) != self.num_envs:
                 raise ValueError(f"seed must hold one entry for each of {self.num_envs} lanes, not {len(seed)}")
             return [None if each is None else _integer("seed", each, 0) for each in seed]
@@ -297,9 +295,9 @@ class MemoryGymVectorEnv(VectorEnv):
         """final_obs and final_info of the lanes whose episode ended, as SyncVectorEnv lays them out."""
         mask = np.zeros(self.num_envs, bool)
         mask[ended] = True
-        final_obs = np.full(self.num_envs, None, object)
+        final_obs = np.empty(self.num_envs, object)
         for lane in ended.tolist():
-            final_obs[lane] = _one(observations, lane)
+            final_obs[lane] = one_of(observations, lane)
         truth = self.ground_truth()
         truth[~mask] = 0.0
         final_info: dict[str, np.ndarray] = {}
@@ -309,6 +307,12 @@ class MemoryGymVectorEnv(VectorEnv):
             final_info[key], final_info[f"_{key}"] = column, mask.copy()
         final_info.update(ground_truth=truth, _ground_truth=mask.copy())
         return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask.copy()}
+
+
+def numbered(every: list[Any]) -> tuple[tuple[Any, ...], list[int]]:
+    """The different ones among these, and for each which of them it is."""
+    different = tuple(dict.fromkeys(every))
+    return different, [different.index(each) for each in every]
 
 
 def widened(array: np.ndarray, width: int) -> np.ndarray:
@@ -322,29 +326,33 @@ def _choices(space: gym.Space) -> int:
     return int(space.nvec[0]) if isinstance(space, gym.spaces.MultiDiscrete) else int(space.n)
 
 
-def _integer(name: str, value: Any, low: int) -> int:
+def _integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
     try:
         number = -1 if isinstance(value, (bool, np.bool_)) else operator.index(value)
     except TypeError:
         number = -1
-    if number < low:
-        raise ValueError(f"{name} must be an integer of at least {low}, not {value!r}")
+    if not low <= number <= high:
+        limit = f"of at least {low}" if high == math.inf else f"from {low} to {high}"
+        raise ValueError(f"{name} must be an integer {limit}, not {brief(value)}")
     return number
 
 
-def _brief(value: Any) -> str:
-    text = repr(value).replace("\n", "")
-    return text if len(text) <= 80 else f"{text[:77]}..."
+def _array(value: Any) -> np.ndarray:
+    """The value as an array, which holds no numbers if rows differ in length."""
+    try:
+        return np.asarray(value)
+    except ValueError:
+        return np.asarray(None)
 
 
-def _one(observations: Any, lane: int) -> Any:
+def one_of(observations: Any, lane: int) -> Any:
     """A copy of the lane's observation."""
     if isinstance(observations, dict):
         return {key: values[lane].copy() for key, values in observations.items()}
     return observations[lane].copy()
 
 
-def _overwrite(observations: Any, lanes: np.ndarray, fresh: Any) -> None:
+def overwrite(observations: Any, lanes: np.ndarray, fresh: Any) -> None:
     """Replaces the lanes' observations, in place."""
     if isinstance(observations, dict):
         for key, values in observations.items():

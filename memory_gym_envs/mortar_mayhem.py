@@ -3,14 +3,15 @@
 Shape letters: N lanes, n some of them, C commands that fit, L steps that the longest clue needs.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import ALL, DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, widened
+from memory_gym_envs.base import ALL, DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, numbered, widened
 from memory_gym_envs.character import (
     FACINGS,
     PAD,
@@ -20,11 +21,15 @@ from memory_gym_envs.character import (
     free_controls,
     grid_controls,
     radius_of,
+    sprites,
     walk,
     wardrobe,
 )
 from memory_gym_envs.drawing import ROW, SCREEN, Sheet, paste, ring, turned_45
+from memory_gym_envs.entries import Entries, vector_slices
+from memory_gym_envs.looks import LARGEST, Looks, View, agent_entries, covered, look, make_looks
 from memory_gym_envs.options import Option
+from memory_gym_envs.words import below, words
 
 TILE = 14  # pixels
 SIZES = range(2, 7)  # tiles along one side of the arena
@@ -33,7 +38,6 @@ TORUS_SIZE = 6  # fills the screen
 # In the original's order: allowed_commands=k allows the first k.
 COMMANDS = ("right", "down", "left", "up", "stay", "right_down", "right_up", "left_down", "left_up")
 MOVES = np.array([(1, 0), (0, 1), (-1, 0), (0, -1), (0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)])  # (9, 2) tiles
-MOVES_LIST = MOVES.tolist()  # for one lane at a time
 VECTOR_ORDER = ("stay", "right", "left", "up", "down", "right_down", "right_up", "left_down", "left_up")
 VECTOR_AT = [VECTOR_ORDER.index(command) for command in COMMANDS]
 VECTOR_COMMANDS = 20  # commands that the command vector has room for
@@ -55,6 +59,7 @@ class Variant:
     jitter: bool  # the agent starts up to two pixels off its tile's centre
     render_fps: int
     options: tuple[Option, ...]
+    entries: tuple[Entries, ...]  # of a vector observation
 
 
 def _options(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
@@ -81,9 +86,23 @@ def _options(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
     return tuple(option for present, option in rows if present)
 
 
+def _entries(clue: bool, endless: bool) -> tuple[Entries, ...]:
+    """What a vector observation of an id is made of."""
+    command = f"the command that is shown, one-hot: {', '.join(COMMANDS)}; zeros: none"
+    rest = f"the commands, as in vector_observation: {VECTOR_COMMANDS} by 9 one-hot, {', '.join(VECTOR_ORDER)}"
+    around = LARGEST // 2 + 1 if endless else 0  # how far beyond the screen's edge an agent may be
+    return (
+        *agent_entries(-around, SCREEN + around),
+        Entries("arena", 1, f"tiles along one side of the arena, / {SIZES[-1]}; 0: an agent hides all of it"),
+        Entries("fire", 1, "1: tiles burn, and it shows"),
+        Entries("safe", 2, "the centre of the tile that does not burn, x and y, / 84 pixels; zeros: none, or hidden"),
+        Entries("command", len(COMMANDS), command) if clue else Entries("commands", VECTOR_COMMANDS * 9, rest),
+    )
+
+
 def _variant(fps: int, grid: bool = False, clue: bool = True, endless: bool = False) -> Variant:
     jitter = endless or not (clue or grid)
-    return Variant(grid, clue, endless, jitter, fps, _options(grid, clue, endless))
+    return Variant(grid, clue, endless, jitter, fps, _options(grid, clue, endless), _entries(clue, endless))
 
 
 VARIANTS = {
@@ -100,14 +119,15 @@ VARIANTS = {
 
 @dataclass
 class State:
-    """One array a field, one row a lane. Positions are stored with PAD added, targets are tiles."""
+    """One array a field, one row a lane. Positions are stored with PAD added, tiles are rows of floors()."""
 
     pos: np.ndarray  # (N, 2) the agent's centre, x and y
     facing: np.ndarray  # (N,)
     figure: np.ndarray  # (N,) which of the batch's figures the agent is
     size: np.ndarray  # (N,) tiles along one side
-    floor: np.ndarray  # (N,) picture of the arena, a row of floors()
-    target: np.ndarray  # (N, 2) the tile to reach
+    blue: np.ndarray  # (N,) picture of the arena when nothing burns, a row of floors()
+    floor: np.ndarray  # (N,) picture of the arena now
+    target: np.ndarray  # (N,) the tile to reach
     goal: np.ndarray  # (N, 2) the first pixel of that tile, with PAD
     truth: np.ndarray  # (N, 2) float64: that tile, divided by arena size - 1
     commands: np.ndarray  # (N, C)
@@ -137,7 +157,7 @@ class State:
 
 def empty_state(lanes: int) -> State:
     """The state of N lanes before their first reset."""
-    shapes = {"pos": (2,), "target": (2,), "goal": (2,), "truth": (2,), "commands": (1,), "clue": (1,)}
+    shapes = {"pos": (2,), "goal": (2,), "truth": (2,), "commands": (1,), "clue": (1,)}
     shapes["vector"] = (VECTOR_COMMANDS * len(COMMANDS),)
     kinds = {"lit": bool, "feedback": bool, "clue": np.uint8, "vector": np.float32}
     kinds |= dict.fromkeys(("truth", "returned", "reward_success", "reward_failure", "reward_episode"), np.float64)
@@ -151,7 +171,7 @@ def empty_state(lanes: int) -> State:
 class Level(NamedTuple):
     """What the generator decides at a reset."""
 
-    tile: tuple[int, int]
+    tile: int  # column * arena size + row
     offset: tuple[int, int]
     commands: list[int]
     show: int
@@ -162,66 +182,62 @@ class Level(NamedTuple):
 
 def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
     """Draws a level in the original's order, so that its seeds mean the same here."""
+    word = words(rng)
     size = TORUS_SIZE if variant.endless else values["arena_size"]
-    tile = divmod(int(rng.integers(0, size * size)), size)
-    offset = (int(rng.integers(-2, 2)), int(rng.integers(-2, 2))) if variant.jitter else (0, 0)
+    tile = below(word, size * size)
+    offset = (below(word, 4) - 2, below(word, 4) - 2) if variant.jitter else (0, 0)
     if variant.endless:
         kinds = values["allowed_commands"]
-        commands = [int(rng.integers(ZERO, BELOW[kinds])) for _ in range(values["initial_command_count"])]
+        commands = [below(word, kinds) for _ in range(values["initial_command_count"])]
     else:
-        commands = draw_walk(rng, tile, _pick(rng, values["command_count"]), size, values["allowed_commands"])
-    show = _pick(rng, values["command_show_duration"]) if variant.clue else 0
-    gap = _pick(rng, values["command_show_delay"]) if variant.clue else 0
-    burn = _pick(rng, values["explosion_duration"])
-    return Level(tile, offset, commands, show, gap, burn, _pick(rng, values["explosion_delay"]))
+        commands = draw_walk(word, tile, _pick(word, values["command_count"]), size, values["allowed_commands"])
+    show = _pick(word, values["command_show_duration"]) if variant.clue else 0
+    gap = _pick(word, values["command_show_delay"]) if variant.clue else 0
+    burn = _pick(word, values["explosion_duration"])
+    return Level(tile, offset, commands, show, gap, burn, _pick(word, values["explosion_delay"]))
 
 
-def draw_walk(rng: np.random.Generator, tile: tuple[int, int], count: int, size: int, kinds: int) -> list[int]:
+def draw_walk(word: Callable[[], int], tile: int, count: int, size: int, kinds: int) -> list[int]:
     """Commands that lead from the tile through the arena without leaving it."""
     steps = _valid_commands(size, kinds)
     commands = []
     for _ in range(count):
         valid = steps[tile]
-        command, tile = valid[rng.integers(ZERO, BELOW[len(valid)])]
+        command, tile = valid[below(word, len(valid))]
         commands.append(command)
     return commands
 
 
-# Arrays without dimensions: the generator takes them faster than numbers, and draws the same.
-ZERO, BELOW = np.array(0), [np.array(limit) for limit in range(len(COMMANDS) + 1)]
-
-
 @cache
-def _valid_commands(size: int, kinds: int) -> dict[tuple[int, int], list[tuple[int, tuple[int, int]]]]:
+def _valid_commands(size: int, kinds: int) -> list[list[tuple[int, int]]]:
     """For every tile the commands that stay inside the arena, each with the tile it leads to."""
     moves = list(enumerate(MOVES[:kinds].tolist()))
-    tiles = [(x, y) for x in range(size) for y in range(size)]
-    inside = set(tiles)
-    return {
-        (x, y): [(command, (x + dx, y + dy)) for command, (dx, dy) in moves if (x + dx, y + dy) in inside]
-        for x, y in tiles
-    }
+    return [
+        [
+            (command, (x + dx) * size + y + dy)
+            for command, (dx, dy) in moves
+            if 0 <= x + dx < size and 0 <= y + dy < size
+        ]
+        for x in range(size)
+        for y in range(size)
+    ]
 
 
-def _pick(rng: np.random.Generator, values: tuple[int, ...]) -> int:
+def _pick(word: Callable[[], int], values: tuple[int, ...]) -> int:
     """What Generator.choice would pick. It draws nothing from a single value."""
-    return values[0] if len(values) == 1 else values[int(rng.integers(0, len(values)))]
+    return values[0] if len(values) == 1 else values[below(word, len(values))]
 
 
 def write_level(s: State, lane: int, level: Level, variant: Variant) -> None:
     """Starts the lane's episode at this level."""
-    size, count = int(s.size[lane]), len(level.commands)
-    origin = SCREEN // 2 - TILE * size // 2 + PAD
-    (x, y), (dx, dy) = level.tile, MOVES_LIST[level.commands[0]]
-    target = ((x + dx) % size, (y + dy) % size)  # only on a torus does a command lead across the border
-    for axis, start in enumerate(level.tile):
-        s.pos[lane, axis] = origin + TILE * start + TILE // 2 + level.offset[axis]
-        s.target[lane, axis] = target[axis]
-        s.goal[lane, axis] = origin + TILE * target[axis]
-        s.truth[lane, axis] = target[axis] / (size - 1)
+    count, tiles, start = len(level.commands), tile_tables(), int(s.blue[lane]) + 1 + level.tile
+    s.pos[lane] = tiles.corner[start] + TILE // 2
+    if variant.jitter:
+        s.pos[lane] += level.offset
+    aim(s, lane, tiles.next[start, level.commands[0]])
     s.facing[lane] = s.current[lane] = s.completed[lane] = s.length[lane] = s.returned[lane] = 0
     s.lit[lane] = False
-    s.floor[lane] = floor_row(size)
+    s.floor[lane] = s.blue[lane]
     s.count[lane] = count
     s.commands[lane, :count] = level.commands
     s.fuse[lane], s.burn[lane], s.show[lane], s.gap[lane] = level.fuse, level.burn, level.show, level.gap
@@ -239,11 +255,13 @@ def write_level(s: State, lane: int, level: Level, variant: Variant) -> None:
 
 def write_clue(s: State, lane: int, commands: list[int]) -> None:
     """Plans what the lane sees at each step of a clue: every command for a while, then nothing for a while."""
-    period = int(s.show[lane] + s.gap[lane])
+    show = int(s.show[lane])
+    period = show + int(s.gap[lane])
     end = period * len(commands)
     plan = s.clue[lane]  # (L,)
     plan[: end + 1] = BLANK
-    plan[:end].reshape(len(commands), period)[:, : s.show[lane]] = np.array(commands)[:, None] + 1
+    for start, command in zip(range(0, end, period), commands, strict=True):
+        plan[start : start + show] = 1 + command
     s.clue_end[lane] = end
 
 
@@ -255,9 +273,8 @@ GREEN = (0, 255, 0)
 SYMBOL, SYMBOL_AT = 24, 31  # width of the symbols' square, and its first pixel on both axes
 
 
-def floor_row(size: int) -> int:
-    """The row of floors() that shows an arena of this size in blue; the lit ones follow, by target tile."""
-    return sum(1 + smaller * smaller for smaller in range(SIZES[0], size))
+# The rows of floors(): every arena in blue, and then burning around each tile. Such a row stands for that tile, too.
+FLOORS = [(size, tile) for size in SIZES for tile in (None, *((x, y) for x in range(size) for y in range(size)))]
 
 
 @cache
@@ -265,21 +282,35 @@ def floors() -> np.ndarray:
     """(F, FRAME) uint8, read-only: every arena, blue or burning around each possible target."""
     blue, red = (np.tile(np.array(color, np.uint8), (TILE, TILE, 1)) for color in (LIGHT_BLUE, LIGHT_RED))
     blue[1:-1, 1:-1], red[1:-1, 1:-1] = BLUE, RED
-    pictures = []
-    for size in SIZES:
-        targets = [None, *((x, y) for x in range(size) for y in range(size))]
-        for target in targets:
-            frame = np.zeros((SCREEN, SCREEN, 3), np.uint8)
-            origin = SCREEN // 2 - TILE * size // 2
-            for x in range(size):
-                for y in range(size):
-                    tile = blue if target is None or (x, y) == target else red
-                    top, left = origin + TILE * y, origin + TILE * x
-                    frame[top : top + TILE, left : left + TILE] = tile
-            pictures.append(frame.reshape(-1))
-    table = np.stack(pictures)
+    table = np.zeros((len(FLOORS), SCREEN, SCREEN, 3), np.uint8)
+    for frame, (size, target) in zip(table, FLOORS, strict=True):
+        origin = SCREEN // 2 - TILE * size // 2
+        for x in range(size):
+            for y in range(size):
+                top, left = origin + TILE * y, origin + TILE * x
+                frame[top : top + TILE, left : left + TILE] = blue if target in (None, (x, y)) else red
+    table = table.reshape(len(FLOORS), -1)
     table.flags.writeable = False
     return table
+
+
+class Tiles(NamedTuple):
+    """What there is to know of tiles, by row of floors()."""
+
+    corner: np.ndarray  # (F, 2) the first pixel, with PAD
+    truth: np.ndarray  # (F, 2) column and row, divided by arena size - 1
+    next: np.ndarray  # (F, 9) the tile that each command leads to, on a torus
+
+
+@cache
+def tile_tables() -> Tiles:
+    """The tables of all tiles. Where a row is no tile, they hold those of the arena's first."""
+    rows = {floor: row for row, floor in enumerate(FLOORS)}
+    places = [(size, *(tile or (0, 0))) for size, tile in FLOORS]
+    size, x, y = np.array(places).T[..., None]  # (F, 1) each
+    corner = SCREEN // 2 - TILE * size // 2 + PAD + TILE * np.hstack([x, y])
+    ahead = [[rows[size, ((x + dx) % size, (y + dy) % size)] for dx, dy in MOVES.tolist()] for size, x, y in places]
+    return Tiles(corner, np.hstack([x, y]) / (size - 1), np.array(ahead))
 
 
 @cache
@@ -322,6 +353,59 @@ def draw(s: State, sheet: Sheet, lanes: np.ndarray | slice) -> np.ndarray:
     return frames.reshape(-1, SCREEN, SCREEN, 3)
 
 
+# ---- vector observations ----
+
+COMMAND_ENTRIES = np.eye(1 + len(COMMANDS), dtype=np.float32)[:, 1:]  # for every symbol; BLANK: zeros
+CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # (4, 2)
+
+
+@cache
+def floor_entries() -> np.ndarray:
+    """(F, 4) float32: arena, fire and safe tile, for every row of floors()."""
+    size, fire = np.array([(size / SIZES[-1], tile is not None) for size, tile in FLOORS]).T
+    safe = (tile_tables().corner - PAD + TILE // 2) / SCREEN * fire[:, None]
+    return np.column_stack([size, fire, safe]).astype(np.float32)
+
+
+@cache
+def symbol_masks() -> np.ndarray:
+    """(10, SCREEN, SCREEN) bool: where each symbol is drawn."""
+    masks = np.zeros((len(symbols()), SCREEN, SCREEN), bool)
+    square = slice(SYMBOL_AT, SYMBOL_AT + SYMBOL)
+    masks[:, square, square] = symbols()[:, :, ::3] > 0
+    return masks
+
+
+@lru_cache(maxsize=16)
+def looks(figures: tuple[Figure, ...], clue: bool) -> Looks:
+    """What can be seen of these figures behind every symbol, where symbols are shown."""
+    views = []
+    for figure in figures:
+        around = (figure.reach + 1) // 2 if figure.torus else 0
+        reach = range(PAD - around, PAD + SCREEN + around + 1)
+        image, solid = sprites(figure.scale)
+        free = ~symbol_masks() if clue else ~symbol_masks()[:1]
+        views += [View(figure.scale, image, solid, each, reach, reach) for each in free]
+    return make_looks(views)
+
+
+def hide_floor(out: np.ndarray, s: State, lanes: np.ndarray | slice, sprite: np.ndarray, looks: Looks) -> None:
+    """Clears the floor's entries (n, 4) of what large agents hide, in place.
+
+    What shows is decided by some pixels alone, which no two floors have in common: the arena's corners and the tile's.
+    """
+    first, size = SCREEN // 2 - TILE * s.size[lanes] // 2 + PAD, s.size[lanes]
+    arena = first[:, None, None] + CORNERS * (TILE * size - 1)[:, None, None]  # (n, 4, 2)
+    tile = s.goal[lanes][:, None] + CORNERS * (TILE - 1)  # (n, 4, 2)
+    points = np.concatenate([arena, tile], axis=1)  # (n, 8, 2)
+    x, y = np.moveaxis(points - PAD, -1, 0)
+    shown = ~covered(looks, sprite, s.pos[lanes], points) & ~symbol_masks()[s.symbol[lanes][:, None], y, x]  # (n, 8)
+    burning = shown[:, :4] & (arena != tile).any(axis=-1)
+    out[:, 0] *= shown[:, :4].any(axis=1)
+    out[:, 1:] *= burning.any(axis=1)[:, None]
+    out[:, 2:] *= shown[:, 4:].any(axis=1)[:, None]
+
+
 # ---- rules ----
 
 
@@ -349,7 +433,7 @@ def light(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     s.lit[lanes] = True
     s.timer[lanes] = s.burn[lanes]
     seen = lanes[s.feedback[lanes]]
-    s.floor[seen] += 1 + s.target[seen, 0] * s.size[seen] + s.target[seen, 1]
+    s.floor[seen] = s.target[seen]
     hit = on_target(s, lanes)
     s.completed[lanes] += hit
     return hit, s.current[lanes] >= s.count[lanes]
@@ -357,15 +441,17 @@ def light(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def put_out(s: State, lanes: np.ndarray) -> None:
     """Puts the fire out and moves the target on by the next command."""
-    seen = lanes[s.feedback[lanes]]
-    s.floor[seen] -= 1 + s.target[seen, 0] * s.size[seen] + s.target[seen, 1]
+    s.floor[lanes] = s.blue[lanes]
     s.lit[lanes] = False
     s.timer[lanes] = s.fuse[lanes]
-    size = s.size[lanes][:, None]  # (n, 1)
-    target = (s.target[lanes] + MOVES[s.commands[lanes, s.current[lanes]]]) % size  # (n, 2)
-    s.target[lanes] = target
-    s.goal[lanes] = SCREEN // 2 - TILE * size // 2 + PAD + TILE * target
-    s.truth[lanes] = target / (size - 1)
+    aim(s, lanes, tile_tables().next[s.target[lanes], s.commands[lanes, s.current[lanes]]])
+
+
+def aim(s: State, lanes: np.ndarray | int, tile: np.ndarray | int) -> None:
+    """Makes these tiles the targets of the lanes."""
+    s.target[lanes] = tile
+    s.goal[lanes] = tile_tables().corner[tile]
+    s.truth[lanes] = tile_tables().truth[tile]
 
 
 class MortarMayhem(MemoryGymVectorEnv):
@@ -411,6 +497,7 @@ class MortarMayhem(MemoryGymVectorEnv):
     """
 
     variants = VARIANTS
+    tables = (*MemoryGymVectorEnv.tables, "_looks")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
         """The observation space of one lane with pixels, and its action space."""
@@ -431,6 +518,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         """Takes over the options of the lanes, and the tables that all lanes' options need."""
         s, variant, values = self.state, self.variant, self.settings[int(lanes[0])]
         s.size[lanes] = values.get("arena_size", TORUS_SIZE)
+        s.blue[lanes] = FLOORS.index((values.get("arena_size", TORUS_SIZE), None))
         s.feedback[lanes] = values["visual_feedback"]
         s.reward_success[lanes] = values["reward_command_success"]
         s.reward_failure[lanes] = values["reward_command_failure"]
@@ -442,9 +530,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         if variant.clue:
             period = max(values["command_show_duration"]) + max(values["command_show_delay"])
             s.clue = widened(s.clue, count * period + 1)
-        every = [self._figure(each) for each in self.settings]
-        self.figures = tuple(dict.fromkeys(every))
-        s.figure[:] = [self.figures.index(figure) for figure in every]
+        self.figures, s.figure[:] = numbered([self._figure(each) for each in self.settings])
         self.place_tables()
 
     def _figure(self, values: dict[str, Any]) -> Figure:
@@ -461,6 +547,13 @@ class MortarMayhem(MemoryGymVectorEnv):
         self._controls = grid_controls() if self.variant.grid else free_controls()
         self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
         self._lane_clue = np.arange(self.num_envs) * self.state.clue.shape[1]  # (N,)
+        if self.obs_type == "vector":
+            self._looks = looks(self.figures, self.variant.clue)
+            views = len(symbols()) if self.variant.clue else 1
+            self._lane_sprites = self.state.figure * (views * FACINGS)  # (N,)
+            self._at = vector_slices(self.variant.entries)
+            # An agent that is no wider than a tile cannot hide one.
+            self._large = any(2 * figure.reach > TILE for figure in self.figures)
 
     def begin(self, lane: int, rng: np.random.Generator) -> None:
         """Draws the lane's next level and starts its episode."""
@@ -478,7 +571,7 @@ class MortarMayhem(MemoryGymVectorEnv):
             s.timer -= acting
             due = s.timer == 0  # only a lane that acts gets there
             if np.count_nonzero(due):
-                self._change_tiles(np.flatnonzero(due), rewards, terminated)
+                self._change_tiles(due.nonzero()[0], rewards, terminated)
             burning = s.lit & acting
             if np.count_nonzero(burning):
                 fallen = burning & ~on_target(s, ALL)
@@ -525,7 +618,7 @@ class MortarMayhem(MemoryGymVectorEnv):
     def _grow(self, lane: int) -> None:
         """Appends a command to the lane's completed sequence and shows it from the next step on."""
         s = self.state
-        command = int(self._rngs[lane].integers(0, self.settings[lane]["allowed_commands"]))
+        command = below(words(self._rngs[lane]), self.settings[lane]["allowed_commands"])
         length = int(s.count[lane])
         if length == s.commands.shape[1]:
             s.commands = widened(s.commands, 2 * length)
@@ -541,6 +634,24 @@ class MortarMayhem(MemoryGymVectorEnv):
             return self.frames(lanes)
         vector = self.state.vector[lanes]
         return {"visual_observation": self.frames(lanes), "vector_observation": vector.copy()}
+
+    def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh vector observations of the lanes, (n, V) float32."""
+        s, at = self.state, self._at
+        sprite = self._lane_sprites[lanes] + s.facing[lanes]  # (n,)
+        out = np.empty((len(sprite), *self.single_observation_space.shape), np.float32)
+        if self.variant.clue:
+            symbol = s.symbol[lanes]
+            sprite += symbol * FACINGS
+            out[:, at["command"]] = COMMAND_ENTRIES.take(symbol, axis=0)
+        else:
+            out[:, at["commands"]] = s.vector[lanes]
+        look(out[:, at["size"].start : at["facing"].stop], self._looks, sprite, s.pos[lanes])
+        floor = out[:, at["arena"].start : at["safe"].stop]
+        floor[:] = floor_entries().take(s.floor[lanes], axis=0)
+        if self._large:
+            hide_floor(floor, s, lanes, sprite, self._looks)
+        return out
 
     def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3)."""

@@ -4,15 +4,14 @@ Shape letters: N lanes, n some of them, M cells of the map, P steps of the path 
 """
 
 import math
-import sys
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, widened
+from memory_gym_envs.base import DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, numbered, widened
 from memory_gym_envs.character import (
     FACINGS,
     PAD,
@@ -22,11 +21,15 @@ from memory_gym_envs.character import (
     free_controls,
     grid_controls,
     radius_of,
+    sprites,
     walk,
     wardrobe,
 )
 from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, magnify, make_sheet, paste, stamp
+from memory_gym_envs.entries import Entries, vector_slices
+from memory_gym_envs.looks import LARGEST, Looks, View, agent_entries, covered, look, make_looks
 from memory_gym_envs.options import Option
+from memory_gym_envs.words import Tape, below
 
 TILE = 12  # pixels
 SIDE = 7  # tiles along one side of the screen, and of a segment of the endless path
@@ -41,6 +44,7 @@ MAP_STRIDES = np.array([ROWS, 1])
 
 PIT = 0  # the step of the path at places that are none; the path's own steps count from 1, the origin
 NOWHERE = -1  # the cell of that step
+FAR = 14  # pixels: who walks further in a step can leave the stored positions
 NO_STEP = -1  # where an agent is while it is put back
 REACHED = -1  # of steps without a reward for reaching them first
 TILE_AT = (np.arange(SPAN) - PAD) // TILE  # of stored positions on the screen
@@ -62,6 +66,7 @@ class Variant:
     endless: bool  # a path without a goal, from left to right; no walking left, and stamina
     render_fps: int
     options: tuple[Option, ...]
+    entries: tuple[Entries, ...]  # of a vector observation
 
 
 def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
@@ -92,8 +97,32 @@ def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
     return tuple(option for present, option in rows if present)
 
 
+def _entries(endless: bool) -> tuple[Entries, ...]:
+    """What a vector observation of an id is made of."""
+    cross = Entries("cross", 1, "1: a red cross shows that the agent fell off")
+    if not endless:
+        places = [
+            Entries(name, 2, f"the centre of the path's {name}, x and y, / 84 pixels; zeros: not shown, or hidden")
+            for name in ("origin", "goal")
+        ]
+        return *agent_entries(0, SCREEN + LARGEST), cross, *places
+    past = (
+        "1: a tile of the path behind the agent shows, by column and then row; its left edge is in one of 8 columns of "
+        "12 pixels, the first of which is left of the screen"
+    )
+    return (
+        *agent_entries(-PAD, SPAN - 1 - PAD),
+        cross,
+        Entries("past", SEGMENT * SIDE, past),
+        Entries("scroll", 1, "how far right of its column's left edge such a tile starts, / 12 pixels"),
+        Entries("ground", 1, "how far left the background has moved and 1, / 12 pixels; 0: there is none"),
+        Entries("bar", 1, "1: the stamina bar is there"),
+        Entries("stamina", 1, "how much of it is green"),
+    )
+
+
 def _variant(fps: int, grid: bool = False, endless: bool = False) -> Variant:
-    return Variant(grid, endless, fps, _options(grid, endless))
+    return Variant(grid, endless, fps, _options(grid, endless), _entries(endless))
 
 
 VARIANTS = {
@@ -113,6 +142,7 @@ class State:
     pos: np.ndarray  # (N, 2) the agent's centre, x and y; in the endless id x is counted along the path
     facing: np.ndarray  # (N,)
     figure: np.ndarray  # (N,) which of the batch's figures the agent is
+    scene: np.ndarray  # (N,) and which of its scenes it is in
     origin: np.ndarray  # (N, 2) where the agent starts and is put back to
     tile: np.ndarray  # (N, 2) the agent's tile, column and row
     step: np.ndarray  # (N,) the path's step at that tile, or PIT
@@ -145,13 +175,14 @@ class State:
     show_past: np.ndarray  # (N,) bool
     show_ground: np.ndarray  # (N,) bool
     show_stamina: np.ndarray  # (N,) bool
-    extras: np.ndarray  # (N,) bool: one of these, but for the past path, or a speed above PAD
+    extras: np.ndarray  # (N,) bool: one of these, but for the past path, or a speed above FAR
     feedback: np.ndarray  # (N,) bool
     camera: np.ndarray  # (N,) float64: pixels between the screen's left edge and the path's, when the agent is there
     depth: np.ndarray  # (N,) columns of the past path that are shown, and the agent's own
     lap: np.ndarray  # (N,) pixels after which the background starts again
     figure_x: np.ndarray  # (N,) where the agent is drawn, in the endless id
     cross_x: np.ndarray  # (N,) likewise the cross
+    cross_fits: np.ndarray  # (N,) bool: that is on the screen, not behind the stamina bar
     limit: np.ndarray  # (N,) steps until truncation
     stamina_level: np.ndarray  # (N,)
     reward_goal: np.ndarray  # (N,) float64
@@ -166,7 +197,7 @@ def empty_state(lanes: int, segments: int) -> State:
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("pos", "origin", "tile"), (2,))
     shapes |= {"speed": (1,), "step_at": cells, "known": cells}
     shapes |= dict.fromkeys(("cell", "heading_at", "reached"), steps)
-    flags = ("fallen", "past", "hurt", "known", "extras", "feedback")
+    flags = ("fallen", "past", "hurt", "cross_fits", "known", "extras", "feedback")
     kinds: dict[str, Any] = dict.fromkeys((*flags, *(f"show_{what}" for what in SHOWN)), bool)
     kinds |= dict.fromkeys(("returned", "camera"), np.float64) | {"walls": object}
     kinds |= dict.fromkeys(("reward_goal", "reward_fall_off", "reward_progress", "reward_step"), np.float64)
@@ -232,74 +263,9 @@ FREE = [[[BORDER[first + at] for at in range(8) if not kept >> at & 1] for kept 
 CLOSED, UNREACHED = 0, 1 << 20  # in place of a cost
 
 WALLS = 33  # the chance of a wall in percent
-# In 32-bit words: below which one that is, and the few for which a number below 100 is drawn again.
-WALL_WORDS = -((-WALLS << 32) // 100)
-AGAIN = {word for part in range(100) if (word := -((-part << 32) // 100)) * 100 % (1 << 32) < (1 << 32) % 100}
-WORD = (1 << 32) - 1
-COSTS = bytes(byte >> 5 for byte in range(256))  # by a word's upper byte: a number below 8
-
-
-class Tape:
-    """What a generator is about to draw, read ahead: a path takes dozens of numbers, and asking for each is slow.
-
-    All bounded integers are made of 32-bit words, which are the halves of the bit generator's 64-bit ones, the lower
-    half first. In the end, the generator goes back and draws those that were used.
-
-    Raises ValueError for a bit generator without such halves, which MT19937 is.
-    """
-
-    def __init__(self, rng: np.random.Generator, paths: int):
-        self.bits = rng.bit_generator
-        self.state = self.bits.state
-        if "has_uint32" not in self.state:
-            raise ValueError(f"a path needs a generator of 64-bit words, as PCG64, not {type(self.bits).__name__}")
-        # The generator keeps the upper half of its last word, used or not.
-        kept, self.used = self.state["uinteger"].to_bytes(4, sys.byteorder), 1 - self.state["has_uint32"]
-        # A path takes 113 words at most, and one more for every number in ten million, which is drawn again.
-        self.load(kept + self.bits.random_raw(60 * paths).tobytes())
-
-    def load(self, words: bytes) -> None:
-        """Takes over the words."""
-        self.words = memoryview(words).cast("I")
-        self.costs = words[3::4].translate(COSTS)  # what below(8) makes of each
-
-    def below(self, limit: int) -> int:
-        """What Generator.integers(0, limit) would draw (Lemire's method)."""
-        if limit == 1:
-            return 0
-        product = self.words[self.used] * limit
-        self.used += 1
-        if product & WORD < limit and product & WORD < (1 << 32) % limit:
-            return self.below(limit)
-        return product >> 32
-
-    def hits(self, things: list[int]) -> list[int]:
-        """Of the things, for each of which a number below 100 is drawn, those where it is below WALLS."""
-        words = self.words[self.used : self.used + len(things)].tolist()
-        if not AGAIN.isdisjoint(words):
-            return [thing for thing in things if self.below(100) < WALLS]
-        self.used += len(things)
-        return [thing for thing, word in zip(things, words, strict=True) if word < WALL_WORDS]
-
-    def picks(self, things: list[int], count: int) -> list[int]:
-        """Takes so many out of the list, as many as there are: each time, things.pop(self.below(len(things)))."""
-        words, used, picked = self.words, self.used, []
-        for limit in range(len(things), max(len(things) - count, 1), -1):
-            product = words[used] * limit
-            used += 1
-            if product & WORD < limit:
-                self.used = used - 1
-                product, used = self.below(limit) << 32, self.used
-            picked.append(things.pop(product >> 32))
-        self.used = used
-        return picked if len(picked) == count else picked + things
-
-    def close(self) -> None:
-        """Leaves the generator as if it had drawn the used words only."""
-        whole, half = divmod(self.used, 2)
-        self.state["has_uint32"], self.state["uinteger"] = 1 - half, self.words[2 * whole]
-        self.bits.state = self.state
-        self.bits.random_raw(whole)
+# Draws of a path: origin's side, start, end, the inside, how many and which of the border, and one for each two places.
+DRAWS = 3 + len(INSIDE) + 1 + 8 + 2 * SIDE * (SIDE - 1)
+SPARE = 7  # for numbers that are drawn again, one in ten million
 
 
 class Level(NamedTuple):
@@ -309,15 +275,20 @@ class Level(NamedTuple):
     walls: list[list[int]]  # the untraceable places of each segment
 
 
+def read_ahead(rng: np.random.Generator, paths: int) -> Tape:
+    """The words that so many paths may take. Asking the generator for one at a time is slow."""
+    return Tape(rng, paths * (DRAWS + SPARE))
+
+
 def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
     """Draws a level in the original's order, so that its seeds mean the same here."""
-    tape = Tape(rng, FIRST_SEGMENTS if variant.endless else 1)
+    tape = read_ahead(rng, FIRST_SEGMENTS if variant.endless else 1)
     if variant.endless:
-        level = draw_segments(tape, tape.below(SIDE), 0, FIRST_SEGMENTS)
+        level = draw_segments(tape, below(tape, SIDE), 0, FIRST_SEGMENTS)
     else:
         choices = values["cardinal_origin_choice"]
-        side = choices[tape.below(len(choices))]
-        start, end = tape.below(SIDE), tape.below(SIDE)
+        side = choices[below(tape, len(choices))] if len(choices) > 1 else choices[0]
+        start, end = below(tape, SIDE), below(tape, SIDE)
         near, far = (0, SIDE - 1) if side in (0, 2) else (SIDE - 1, 0)
         if side in (0, 1):
             start, end = near * SIDE + start, far * SIDE + end
@@ -333,7 +304,7 @@ def draw_segments(tape: Tape, row: int, first: int, count: int) -> Level:
     """Draws segments of an endless path, from this row on, the first of them being segment number `first`."""
     path, every_wall = [], []
     for segment in range(first, first + count):
-        start, end = row, (SIDE - 1) * SIDE + tape.below(SIDE)
+        start, end = row, (SIDE - 1) * SIDE + below(tape, SIDE)
         walls = draw_walls(tape, start, end)
         path += cells_of(draw_path(tape, walls, start, end), segment)
         path.append(path[-1] + ROWS)  # the transition tile
@@ -347,16 +318,16 @@ def draw_walls(tape: Tape, start: int, end: int) -> list[int]:
 
     So there always is a path: along the border, and one ring further inside past the walls that stand there.
     """
-    walls, kept_free = tape.hits(INSIDE), NEAR[start] | NEAR[end]
+    walls, kept_free = tape.hits(INSIDE, WALLS), NEAR[start] | NEAR[end]
     for place in walls:
         kept_free |= AROUND[place]
     free = FREE[0][kept_free & 255] + FREE[1][kept_free >> 8 & 255] + FREE[2][kept_free >> 16]
-    return walls + tape.picks(free, (4, 8)[tape.below(2)])
+    return walls + tape.picks(free, (4, 8)[below(tape, 2)])
 
 
 def draw_path(tape: Tape, walls: list[int], start: int, end: int) -> list[int]:
     """The path that A* finds over random costs, not always the cheapest: its places from start to end."""
-    costs, used, distance = tape.costs, tape.used, DISTANCES[end]
+    costs, used, distance = tape.eighths, tape.used, DISTANCES[end]
     cost, total, previous = [UNREACHED] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
     for place in walls:
         cost[place] = CLOSED
@@ -448,7 +419,7 @@ WHITE, GREY, ICE = (255, 255, 255), (210, 210, 210), (125, 177, 250)
 BLUE, GREEN, RED = (0, 0, 255), (0, 255, 0), (255, 0, 0)
 CROSS = 10  # width of the cross
 BAR = 4  # width of the stamina bar
-PAST, STEP, ORIGIN, GOAL, WALL = range(5)  # rows of tiles()
+STEP, ORIGIN, GOAL, WALL = range(4)  # rows of tiles()
 BACK = np.arange(1, (2 * SIDE - 1) * SIDE + 1)  # steps back that can be drawn: those on less than two segments
 
 
@@ -464,18 +435,22 @@ def tile_picture(inner: tuple[int, int, int], border: tuple[int, int, int]) -> n
 @cache
 def tiles() -> Sheet:
     """Every kind of tile, to be pasted where a part of it may be off the screen."""
-    colors = [(WHITE, GREY), (WHITE, WHITE), (BLUE, BLUE), (GREEN, GREEN), (RED, RED)]
+    colors = [(WHITE, GREY), (BLUE, BLUE), (GREEN, GREEN), (RED, RED)]
     pictures = np.stack([tile_picture(*color) for color in colors])
     return make_sheet(pictures, np.ones(pictures.shape[:3], bool), np.arange(SPAN) - PAD)
 
 
+def cross_mask() -> np.ndarray:
+    """(CROSS, CROSS) bool: two diagonals, three pixels wide."""
+    rows, columns = np.indices((CROSS, CROSS))
+    return (abs(rows - columns) <= 1) | (abs(rows + columns - CROSS + 1) <= 1)
+
+
 @cache
 def crosses() -> Sheet:
-    """The red cross: two diagonals, three pixels wide."""
-    rows, columns = np.indices((CROSS, CROSS))
-    mask = (abs(rows - columns) <= 1) | (abs(rows + columns - CROSS + 1) <= 1)
+    """The red cross."""
     picture = np.tile(np.array(RED, np.uint8), (CROSS, CROSS, 1))
-    return make_sheet(picture[None], mask[None], np.arange(SPAN) - PAD)
+    return make_sheet(picture[None], cross_mask()[None], np.arange(SPAN) - PAD)
 
 
 @cache
@@ -527,9 +502,7 @@ def tile_centres(cell: np.ndarray) -> np.ndarray:
 def draw_endless_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     """(n, FRAME): black or the background, and the path behind the agent where it is shown."""
     if np.count_nonzero(s.extras[lanes]):
-        # Starts again as soon as it has moved by a tile or more, which jumps if the speed does not divide that.
-        walked = s.pos[lanes, 0] - s.origin[lanes, 0]
-        frames = grounds().take((walked % s.lap[lanes] + 1) * s.show_ground[lanes], axis=0)
+        frames = grounds().take(ground_rows(s, lanes), axis=0)
     else:
         frames = np.zeros((len(s.at[lanes]), FRAME), np.uint8)
     if np.count_nonzero(s.past[lanes]):
@@ -537,47 +510,141 @@ def draw_endless_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     return frames
 
 
+def ground_rows(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+    """(n,) the rows of grounds() that are behind everything."""
+    # Starts again as soon as it has moved by a tile or more, which jumps if the speed does not divide that.
+    walked = s.pos[lanes, 0] - s.origin[lanes, 0]
+    return (walked % s.lap[lanes] + 1) * s.show_ground[lanes]
+
+
 def draw_trail(frames: np.ndarray, s: State, lanes: np.ndarray | slice) -> None:
     """Draws the past path on the lanes' frames, in place."""
-    lane, y = s.trail_lane, s.trail_y  # (m,)
-    # A camera between two pixels cuts the fraction off, towards zero.
-    x = (s.trail_x - (s.pos[:, 0] - s.origin[:, 0] - s.camera)[lane]).astype(np.int64)
-    if isinstance(lanes, slice):
-        owner = lane
-    else:
-        frame = np.full(len(s.at), NOWHERE)
-        frame[lanes] = np.arange(len(lanes))
-        mine = frame[lane] != NOWHERE
-        owner, x, y = frame[lane[mine]], x[mine], y[mine]
+    owner, x, y = trail_on_screen(s, lanes)
     whole = (x >= 0) & (x <= SCREEN - TILE)
     if np.count_nonzero(whole) < len(whole):
         cut = ~whole & (x > -TILE) & (x < SCREEN)
         centres = np.stack([x[cut], y[cut]], axis=1) + TILE // 2 + PAD
         # Before the whole tiles, which then cover what the cut ones' squares have of them.
-        paste(frames, tiles(), np.full(len(centres), PAST), centres, owner[cut])
+        paste(frames, tiles(), np.full(len(centres), STEP), centres, owner[cut])
         owner, x, y = owner[whole], x[whole], y[whole]
     stamp(frames, tile_picture(WHITE, GREY), owner, x, y)
 
 
-def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: np.ndarray | slice, endless: bool) -> None:
-    """Draws the agents, their stamina and their crosses on the frames (n, FRAME), in place."""
-    pos, extras = s.pos[lanes], endless and np.count_nonzero(s.extras[lanes])
+def trail_on_screen(s: State, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The past path of the lanes: for each tile, (m,), whose of them it is, and its first pixel, x and y."""
+    lane, y = s.trail_lane, s.trail_y  # (m,)
+    # A camera between two pixels cuts the fraction off, towards zero.
+    x = (s.trail_x - (s.pos[:, 0] - s.origin[:, 0] - s.camera)[lane]).astype(np.int64)
+    if isinstance(lanes, slice):
+        return lane, x, y
+    frame = np.full(len(s.at), NOWHERE)
+    frame[lanes] = np.arange(len(lanes))
+    owner = frame[lane]
+    mine = owner != NOWHERE
+    return owner[mine], x[mine], y[mine]
+
+
+def place_on_screen(s: State, lanes: np.ndarray | slice, endless: bool) -> np.ndarray:
+    """(n, 2) where the agents are drawn."""
+    pos = s.pos[lanes]
     if endless:
         pos = pos.copy()
         pos[:, 0] = s.figure_x[lanes]
-        if extras:  # a fast agent may be far off the screen
+        if np.count_nonzero(s.extras[lanes]):  # a fast agent may be far off the screen
             np.clip(pos, 0, SPAN - 1, out=pos)
+    return pos
+
+
+def spent_stamina(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+    """(n,) how many pixels of the bar are red."""
+    return (SCREEN * (1 - s.stamina[lanes] / s.stamina_level[lanes])).astype(np.int64)
+
+
+def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: np.ndarray | slice, endless: bool) -> None:
+    """Draws the agents, their stamina and their crosses on the frames (n, FRAME), in place."""
+    pos, extras = place_on_screen(s, lanes, endless), endless and np.count_nonzero(s.extras[lanes])
     paste(frames, sheet, s.figure[lanes] * FACINGS + s.facing[lanes], pos)
     if extras:
         shown = s.show_stamina[lanes]
-        spent = (SCREEN * (1 - s.stamina[lanes] / s.stamina_level[lanes])).astype(np.int64)  # (n,) pixels
-        frames.reshape(-1, SCREEN, ROW)[shown, :, -3 * BAR :] = bars()[spent[shown]]
+        frames.reshape(-1, SCREEN, ROW)[shown, :, -3 * BAR :] = bars()[spent_stamina(s, lanes)[shown]]
     (which,) = s.hurt[lanes].nonzero()
     if which.size:
         cross = pos[which]
         if endless:
             cross[:, 0] = s.cross_x[lanes][which]
         paste(frames, crosses(), np.zeros_like(which), cross, which)
+
+
+# ---- vector observations ----
+
+CROSS_FITS = abs(np.arange(SPAN) - PAD - SCREEN // 2) < (SCREEN + CROSS) // 2  # of stored positions along y
+CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # (4, 2)
+
+
+class Scene(NamedTuple):
+    """What decides how much of an agent shows. Lanes whose options agree share one."""
+
+    scale: float
+    column: int | None  # the stored position where the agent is always drawn, in the endless id
+    aside: int  # how far right of the agent's centre its cross is drawn
+    width: int  # pixels of the screen that are left of the stamina bar
+
+
+@lru_cache(maxsize=16)
+def looks(scenes: tuple[Scene, ...]) -> Looks:
+    """What can be seen of the agent in these scenes, without a cross and with one."""
+    views = []
+    for scene in scenes:
+        free = np.zeros((SCREEN, SCREEN), bool)
+        free[:, : scene.width] = True
+        rows = range(SPAN) if scene.column else range(PAD, PAD + SCREEN + LARGEST + 1)
+        columns = range(scene.column, scene.column + 1) if scene.column else rows
+        image, solid = sprites(scene.scale)
+        for picture in ((image, solid), crossed(image, solid, scene.aside)):
+            views.append(View(scene.scale, *picture, free, columns, rows))
+    return make_looks(views)
+
+
+def crossed(image: np.ndarray, solid: np.ndarray, aside: int) -> tuple[np.ndarray, np.ndarray]:
+    """The figure's sprites with a cross over them, so far right of their middle."""
+    margin = max(0, CROSS // 2 + abs(aside) - solid.shape[1] // 2)
+    around = ((0, 0), (margin, margin), (margin, margin))
+    image, solid = np.pad(image, (*around, (0, 0))), np.pad(solid, around)
+    first = solid.shape[1] // 2 - CROSS // 2
+    square = (slice(None), slice(first, first + CROSS), slice(first + aside, first + aside + CROSS))
+    image[square][:, cross_mask()], solid[square][:, cross_mask()] = RED, True
+    return image, solid
+
+
+def show_ends(out: np.ndarray, s: State, lanes: np.ndarray | slice, looks: Looks, sprite: np.ndarray) -> None:
+    """Writes the path's origin and goal to out, (n, 4) and zeros so far, where they are shown and not hidden."""
+    which, last = np.arange(len(out)), s.count[lanes]
+    for end, shown, step in ((0, s.show_origin[lanes], np.ones_like(last)), (2, s.show_goal[lanes], last)):
+        centre = tile_centres(s.cell[lanes][which, step])  # (n, 2)
+        points = centre[:, None] - TILE // 2 + CORNERS * (TILE - 1)  # (n, 4, 2)
+        shown = shown & ~covered(looks, sprite, s.pos[lanes], points).all(axis=1)
+        out[:, end : end + 2] = (centre - PAD) / SCREEN * shown[:, None]
+
+
+def show_trail(out: np.ndarray, s: State, lanes: np.ndarray | slice, looks: Looks, agent: Any) -> None:
+    """Writes the past path and the scroll of its tiles to out, (n, 57) and zeros so far. A tile shows if a corner does.
+
+    agent: sprites (n,) and where they are drawn (n, 2) of agents that may hide a tile, or None.
+    """
+    owner, x, y = trail_on_screen(s, lanes)
+    inset, width = 0, SCREEN
+    if np.count_nonzero(s.extras[lanes]):
+        # The background has the same corners, but not the pixels inside them.
+        inset, width = s.show_ground[lanes][owner], (SCREEN - BAR * s.show_stamina[lanes])[owner]  # (m,)
+    shown = (x + inset < width) & (x + (TILE - 1) - inset >= 0)
+    if agent is not None:
+        corners = np.stack([x, y], axis=1)[:, None] + abs(CORNERS * (TILE - 1) - np.reshape(inset, (-1, 1, 1)))
+        free = (corners[..., 0] >= 0) & (corners[..., 0] < np.reshape(width, (-1, 1)))  # (m, 4)
+        shown = (free & ~covered(looks, *(each[owner] for each in agent), corners + PAD)).any(axis=1)
+    owner, x, y = owner[shown], x[shown], y[shown]
+    out[owner, (x // TILE + 1) * SIDE + y // TILE] = 1.0
+    # Not all of a path's tiles have the same, where the camera is between two pixels.
+    np.maximum.at(out[:, -1], owner, (x % TILE / TILE).astype(np.float32))
 
 
 # ---- rules ----
@@ -651,6 +718,14 @@ def fall(s: State, cell: np.ndarray) -> np.ndarray:
     return over
 
 
+def camera_columns(values: dict[str, Any]) -> tuple[int, int]:
+    """Where the endless id draws the agent, and where its cross: stored positions along x."""
+    radius, camera = radius_of(values["agent_scale"]), TILE * values["camera_offset_scale"]
+    # The original cuts the fraction off at the corner of the agent's sprite, and rounds the cross's middle.
+    corner = (2 * radius + int(10 * values["agent_scale"]) + 14) // 2
+    return corner + int(radius - corner + camera) + PAD, math.floor(radius + camera + 0.5) + PAD
+
+
 class MysteryPath(MemoryGymVectorEnv):
     """Mystery Path (thesis 4.4; memory-gym 1.0.2), N lanes at once.
 
@@ -691,6 +766,7 @@ class MysteryPath(MemoryGymVectorEnv):
     """
 
     variants = VARIANTS
+    tables = (*MemoryGymVectorEnv.tables, "_looks")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
         """The observation space of one lane with pixels, and its action space."""
@@ -702,6 +778,7 @@ class MysteryPath(MemoryGymVectorEnv):
         """Makes the state of N lanes."""
         self.state = empty_state(self.num_envs, FIRST_SEGMENTS + 1 if self.variant.endless else 1)
         self.figures = (self._figure(self.defaults),)  # all that differ, of all lanes
+        self.scenes = (self._scene(self.defaults),)  # likewise
         self.place_tables()
 
     def configure(self, lanes: np.ndarray) -> None:
@@ -712,7 +789,7 @@ class MysteryPath(MemoryGymVectorEnv):
         for what, option in SHOWN.items():
             getattr(s, f"show_{what}")[lanes] = values.get(option, False)
         shown = any(values.get(option, False) for what, option in SHOWN.items() if what != "past")
-        s.extras[lanes] = shown or values.get("agent_speed", 0.0) > PAD
+        s.extras[lanes] = shown or values.get("agent_speed", 0.0) > FAR
         s.reward_goal[lanes] = values.get("reward_goal", 0.0)
         s.reward_fall_off[lanes] = values["reward_fall_off"]
         s.reward_progress[lanes] = values["reward_path_progress"]
@@ -720,26 +797,30 @@ class MysteryPath(MemoryGymVectorEnv):
         s.stamina_level[lanes] = values.get("stamina_level", 1)
         if self.variant.endless:
             self._place_camera(lanes, values)
-        every = [self._figure(each) for each in self.settings]
-        self.figures = tuple(dict.fromkeys(every))
-        s.figure[:] = [self.figures.index(figure) for figure in every]
+        self.figures, s.figure[:] = numbered([self._figure(each) for each in self.settings])
+        self.scenes, s.scene[:] = numbered([self._scene(each) for each in self.settings])
         self.place_tables()
 
     def _place_camera(self, lanes: np.ndarray, values: dict[str, Any]) -> None:
-        s, scale, speed = self.state, values["agent_scale"], int(values["agent_speed"])
-        camera = TILE * values["camera_offset_scale"]
-        s.camera[lanes], s.depth[lanes], s.speed[lanes] = camera, int(values["camera_offset_scale"]), speed
+        s, speed = self.state, int(values["agent_speed"])
+        s.camera[lanes], s.depth[lanes] = TILE * values["camera_offset_scale"], int(values["camera_offset_scale"])
+        s.speed[lanes] = speed
         s.lap[lanes] = speed * math.ceil(TILE / speed) if speed else 1
-        # The original cuts the fraction off at the corner of the agent's sprite, and rounds the cross's middle.
-        radius, corner = radius_of(scale), (2 * radius_of(scale) + int(10 * scale) + 14) // 2
-        s.figure_x[lanes] = corner + int(radius - corner + camera) + PAD
-        s.cross_x[lanes] = math.floor(radius + camera + 0.5) + PAD
+        s.figure_x[lanes], s.cross_x[lanes] = camera_columns(values)
+        s.cross_fits[lanes] = camera_columns(values)[1] < PAD + SCREEN - BAR * values["show_stamina"] + CROSS // 2
 
     def _figure(self, values: dict[str, Any]) -> Figure:
         if self.variant.grid:
             return Figure(0.25, TILE, 0, SCREEN, TILE // 2, False)
         scale = values["agent_scale"]
         return Figure(scale, values["agent_speed"], 0, SCREEN, radius_of(scale), False)
+
+    def _scene(self, values: dict[str, Any]) -> Scene:
+        scale = 0.25 if self.variant.grid else values["agent_scale"]
+        if not self.variant.endless:
+            return Scene(scale, None, 0, SCREEN)
+        figure_x, cross_x = camera_columns(values)
+        return Scene(scale, figure_x, cross_x - figure_x, SCREEN - BAR * values["show_stamina"])
 
     def place_tables(self) -> None:
         """The flat tables that step() looks things up in, and where each lane's rows start in them."""
@@ -749,6 +830,11 @@ class MysteryPath(MemoryGymVectorEnv):
         self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
         self._lane_map = np.arange(self.num_envs) * self.state.step_at.shape[1] + BEYOND  # (N,)
         self._lane_path = np.arange(self.num_envs) * self.state.cell.shape[1]  # (N,)
+        if self.obs_type == "vector":
+            self._looks = looks(self.scenes)
+            self._at = vector_slices(self.variant.entries)
+            # An agent that is no wider than a tile cannot hide one.
+            self._large = any(2 * radius_of(scene.scale) > TILE for scene in self.scenes)
 
     def begin(self, lane: int, rng: np.random.Generator) -> None:
         """Draws the lane's next level and starts its episode."""
@@ -817,12 +903,41 @@ class MysteryPath(MemoryGymVectorEnv):
         for lane in np.flatnonzero(entered).tolist():
             steps, segments = int(s.count[lane]), int(s.segments[lane])
             row = int(s.cell[lane, steps]) % ROWS - BEYOND
-            tape = Tape(self._rngs[lane], 1)
+            tape = read_ahead(self._rngs[lane], 1)
             level = draw_segments(tape, row, segments, 1)
             tape.close()
             if make_room(s, steps + len(level.path), segments + 1):
                 self.place_tables()
             write_path(s, lane, level, self.variant)
+
+    def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh vector observations of the lanes, (n, V) float32."""
+        s, at, endless = self.state, self._at, self.variant.endless
+        pos, hurt = place_on_screen(s, lanes, endless), s.hurt[lanes]
+        sprite = (2 * s.scene[lanes] + hurt) * FACINGS + s.facing[lanes]  # (n,)
+        out = np.zeros((len(hurt), *self.single_observation_space.shape), np.float32)
+        look(out[:, at["size"].start : at["facing"].stop], self._looks, sprite, pos)
+        if endless:
+            self._show_endless(out, lanes, sprite, pos)
+        else:
+            out[:, at["cross"]] = hurt[:, None]
+            if np.count_nonzero(s.extras[lanes]):
+                show_ends(out[:, at["origin"].start : at["goal"].stop], s, lanes, self._looks, sprite)
+        return out
+
+    def _show_endless(self, out: np.ndarray, lanes: np.ndarray | slice, sprite: np.ndarray, pos: np.ndarray) -> None:
+        """Writes what only the endless id has, or has off the screen."""
+        s, at = self.state, self._at
+        hurt = s.hurt[lanes]
+        if np.count_nonzero(hurt):
+            out[:, at["cross"].start] = hurt & s.cross_fits[lanes] & CROSS_FITS.take(pos[:, 1])
+        if np.count_nonzero(s.past[lanes]):
+            trail = out[:, at["past"].start : at["scroll"].stop]
+            show_trail(trail, s, lanes, self._looks, (sprite, pos) if self._large else None)
+        if np.count_nonzero(s.extras[lanes]):
+            out[:, at["ground"].start] = ground_rows(s, lanes) / TILE
+            out[:, at["bar"].start] = s.show_stamina[lanes]
+            out[:, at["stamina"].start] = s.show_stamina[lanes] * (1 - spent_stamina(s, lanes) / SCREEN)
 
     def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3)."""
@@ -843,11 +958,12 @@ class MysteryPath(MemoryGymVectorEnv):
         return numbers | {"success": success, "num_fails": s.fails[lanes]}
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
-        """Draws the path in white, its origin blue, its goal green and the walls red, then the agent over them."""
+        """Draws the path in white, its origin and transition tiles blue, its goal green, walls red, then the agent."""
         s, one, endless = self.state, np.array([lane]), self.variant.endless
         small = draw_endless_ground(s, one) if endless else draw_ground(s, one)  # (1, FRAME)
         steps = int(s.count[lane])
-        marks = [(cell, STEP) for cell in s.cell[lane, 1 : steps + 1].tolist()]
+        path = s.cell[lane, 1 : steps + 1].tolist()
+        marks = [(cell, ORIGIN if cell // ROWS % SEGMENT == SIDE else STEP) for cell in path]
         marks[0] = (marks[0][0], ORIGIN)
         if not endless:
             marks[-1] = (marks[-1][0], GOAL)

@@ -7,7 +7,6 @@ dictionary of plain Python values, or raises one `ValueError` that says which op
 
 import difflib
 import json
-import math
 import numbers
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 LONGEST_LIST = 100
+LARGEST = 10**9  # sums of numbers up to that stay exact enough for rewards, and far from where int64 ends
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Option:
     """One reset parameter.
 
     kind: "bool", "int", "float" or "ints" (a list of integers, one of which is drawn at every reset).
-    low, high: the allowed range, both ends included; None: no limit on that side.
+    low, high: the allowed range, both ends included; None: as far as LARGEST on that side.
     also: single values allowed besides the range.
     empty: whether a list may have no entries.
     """
@@ -38,19 +38,34 @@ class Option:
     empty: bool = False
 
     @property
+    def bounds(self) -> tuple[float, float]:
+        """The ends of the allowed range, in numbers."""
+        return -LARGEST if self.low is None else self.low, LARGEST if self.high is None else self.high
+
+    @property
     def allowed(self) -> str:
         """The allowed values in words."""
-        noun = {"bool": "true or false", "int": "an integer", "float": "a number", "ints": "a list of integers"}
-        text = noun[self.kind] + _range_text(self.low, self.high) + (", possibly none" if self.empty else "")
+        if self.kind == "bool":
+            return "true or false"
+        noun = {
+            "int": "an integer",
+            "float": "a number",
+            "ints": f"a list of {self._shortest} to {LONGEST_LIST} integers",
+        }
+        text = "{} from {} to {}".format(noun[self.kind], *self.bounds)
         return " or ".join([*(str(value) for value in self.also), text])
+
+    @property
+    def _shortest(self) -> int:
+        return 0 if self.empty else 1
 
     def parse(self, value: Any) -> Any:
         """Returns the value as plain Python (bool, int, float or tuple of int), or None if it is not allowed."""
         if self.kind == "bool":
             return bool(value) if isinstance(value, (bool, np.bool_)) else None
         if self.kind == "ints":
-            shortest = 0 if self.empty else 1
-            if not isinstance(value, (list, tuple, np.ndarray)) or not shortest <= len(value) <= LONGEST_LIST:
+            listed = isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.ndim == 1)
+            if not listed or not self._shortest <= len(value) <= LONGEST_LIST:
                 return None
             numbers_ = tuple(self._number(item, int) for item in value)
             return None if None in numbers_ else numbers_
@@ -58,19 +73,14 @@ class Option:
 
     def _number(self, value: Any, of: type) -> Any:
         abstract = numbers.Integral if of is int else numbers.Real
-        if isinstance(value, (bool, np.bool_)) or not isinstance(value, abstract) or not math.isfinite(value):
+        if isinstance(value, (bool, np.bool_)) or not isinstance(value, abstract):
             return None
-        number = of(value)
-        inside = (self.low is None or number >= self.low) and (self.high is None or number <= self.high)
-        return number if inside or number in self.also else None
-
-
-def _range_text(low: float | None, high: float | None) -> str:
-    if low is None and high is None:
-        return ""
-    if high is None:
-        return f" of at least {low}"
-    return f" from {low} to {high}"
+        try:
+            number = of(value)
+        except OverflowError:  # an integer that no float can hold
+            return None
+        low, high = self.bounds
+        return number if low <= number <= high or number in self.also else None
 
 
 def resolve(options: tuple[Option, ...], given: Mapping[str, Any] | None, owner: str) -> dict[str, Any]:
@@ -80,18 +90,27 @@ def resolve(options: tuple[Option, ...], given: Mapping[str, Any] | None, owner:
     `owner` is the id that the message names.
     """
     if given is not None and not isinstance(given, Mapping):
-        raise ValueError(f"{owner}: options must be a dictionary or None, not {given!r}")
+        raise ValueError(f"{owner}: options must be a dictionary or None, not {brief(given)}")
     table = {option.name: option for option in options}
     values = {name: option.parse(option.default) for name, option in table.items()}
     for name, value in (given or {}).items():
         if name not in table:
-            near = table[difflib.get_close_matches(str(name), table, n=1, cutoff=0.0)[0]]
-            raise ValueError(f"{owner} has no option {name!r}; the nearest is {near.name!r} ({near.allowed})")
+            near = table[difflib.get_close_matches(brief(name), table, n=1, cutoff=0.0)[0]]
+            raise ValueError(f"{owner} has no option {brief(name)}; the nearest is {near.name!r} ({near.allowed})")
         parsed = table[name].parse(value)
         if parsed is None:
-            raise ValueError(f"{owner}: option {name!r} must be {table[name].allowed}, not {value!r}")
+            raise ValueError(f"{owner}: option {name!r} must be {table[name].allowed}, not {brief(value)}")
         values[name] = parsed
     return values
+
+
+def brief(value: Any) -> str:
+    """The value in at most 80 characters on one line, for an error message."""
+    try:
+        text = repr(value).replace("\n", "")
+    except ValueError:  # Python writes out no integer of more than 4300 digits
+        text = "a number too large to be written out"
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def options_table(options: tuple[Option, ...]) -> str:

@@ -25,6 +25,7 @@ from memory_gym_envs.character import (
     wardrobe,
 )
 from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, disk, magnify, make_sheet, paste, ring
+from memory_gym_envs.entries import Entries
 from memory_gym_envs.options import Option
 
 TILE = 12  # pixels; the floor is a chessboard
@@ -35,6 +36,7 @@ MARGIN = 7  # coins and the exit stay that far from the screen's edges
 AGENT_SPACE, COIN_SPACE = 28, 21  # pixels around a place where nothing else is put
 SPOT_RADII = (1, 42)  # pixels; the largest light is as wide as the screen
 MOST_COINS = 20
+MOST_SPOTS = 200  # slow spotlights stay for ever, so others may come ever faster than they leave
 
 AGENT, EXIT, COIN = 0, 1, 2  # bodies; coins are the last ones
 GONE = 1000  # where bodies are that do not exist, in pixels
@@ -62,6 +64,7 @@ class Variant:
     endless: bool  # one coin after the other, no exit
     render_fps: int
     options: tuple[Option, ...]
+    entries: tuple[Entries, ...] = ()  # of a vector observation
 
 
 UNUSED = "ignored, as in the original"
@@ -689,6 +692,15 @@ def darken(
 # ---- rules ----
 
 
+def spot_places(spots: np.ndarray) -> np.ndarray:
+    """Where spotlights (11, N, S) are on their ways, x and y in pixels: (2, N, S) float64."""
+    place = spots[TIME] * spots[BEND]
+    place += spots[TOWARD]
+    place *= spots[TIME]
+    place += spots[START]
+    return place
+
+
 def retire(s: State) -> tuple[np.ndarray, np.ndarray]:
     """Removes the spotlights that are through: lanes and slots, each (n,), of those that pause for this step.
 
@@ -778,7 +790,8 @@ class SearingSpotlights(MemoryGymVectorEnv):
     Differences from the original: images are rows first; max_steps truncates; the finite id reports ground truth;
         nothing that an episode drew or painted black or white shows in the next; no exit, no coins and a hidden action
         bar work; coins for which no free pixel is left are put anywhere; a smallest radius or speed above the largest
-        replaces it; `coin_enabled` is new; wrong options raise ValueError.
+        replaces it; at most MOST_SPOTS spotlights shine at once, and no further one comes until one is gone;
+        `coin_enabled` is new; wrong options raise ValueError.
     """
 
     variants = VARIANTS
@@ -792,7 +805,6 @@ class SearingSpotlights(MemoryGymVectorEnv):
         """Makes the state of N lanes."""
         self.state = empty_state(self.num_envs)
         self._settle()
-        self._through = False  # whether any spotlight has to be removed
         self._unlocked: list[int] = []  # lanes without coins, whose exits open in the first step
         self.place_tables()
 
@@ -806,7 +818,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         s.coin_limit[lanes] = _limit(values["steps_per_coin"] if endless and values["coin_enabled"] else -1)
         s.coin_show[lanes] = NO_LIMIT if values["coins_visible"] else _limit(values.get("coin_show_duration", 0))
         waits = ("spawn_interval",) if endless else ("initial_spawn_interval", "spawn_interval_threshold")
-        s.interval[lanes] = max(1, _limit(sum(values[name] for name in waits)))
+        s.interval[lanes] = max(1, sum(values[name] for name in waits))
         radius = radius_of(values["agent_scale"])
         coin, exit_ = int(10 * values["coin_scale"]), 10 * values.get("exit_scale", 0.0)
         s.touch[lanes, COIN:], s.touch[lanes, EXIT] = (coin + radius) ** 2, (exit_ + radius) ** 2
@@ -900,9 +912,10 @@ class SearingSpotlights(MemoryGymVectorEnv):
         np.subtract(s.pos.T, PAD, out=s.bodies[:, :, AGENT])
 
     def _spawn(self, lane: int) -> None:
-        """Adds a spotlight to the lane's."""
+        """Adds a spotlight to the lane's, if there is room."""
         s = self.state
-        add_spot(s, lane, draw_spot(self._rngs[lane], self.settings[lane]))
+        if s.count[lane] < MOST_SPOTS:
+            add_spot(s, lane, draw_spot(self._rngs[lane], self.settings[lane]))
         s.spawns[lane] -= 1
         # Always the first interval of the original's list, as its spawns remove the last one.
         s.wait[lane] = s.interval[lane] if s.spawns[lane] else NO_LIMIT
@@ -910,12 +923,9 @@ class SearingSpotlights(MemoryGymVectorEnv):
     def _shine(self) -> np.ndarray:
         """Moves the spotlights on; (N,) bool whose agent is in the light."""
         s = self.state
-        pausing = retire(s) if self._through else None
+        pausing = retire(s) if np.count_nonzero(s.spots[TIME] >= 1.0) else None
         time = s.spots[TIME]  # (N, S)
-        spot = time * s.spots[BEND]  # (2, N, S)
-        spot += s.spots[TOWARD]
-        spot *= time
-        spot += s.spots[START]
+        spot = spot_places(s.spots)  # (2, N, S)
         place = spot.astype(np.int64)
         place += s.spot_key
         spot -= s.bodies[:, :, :1]
@@ -927,7 +937,6 @@ class SearingSpotlights(MemoryGymVectorEnv):
             held = time[pausing]
             time += s.spots[SPEED]
             time[pausing], distance[pausing], place[(ALL, *pausing)] = held, np.inf, 0
-        self._through = np.count_nonzero(time >= 1.0) > 0
         s.place, s.seen = place, (distance <= s.spots[SIGHT]).any(axis=1)
         return (distance <= s.spots[REACH]).any(axis=1) if np.count_nonzero(s.seen) else s.seen
 
@@ -1012,7 +1021,7 @@ RULES = {
 
 
 def _limit(steps: int) -> int:
-    return NO_LIMIT if steps == -1 else min(steps, NO_LIMIT)
+    return NO_LIMIT if steps == -1 else steps
 
 
 def _fading(duration: int, threshold: int) -> np.ndarray:

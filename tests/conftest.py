@@ -4,6 +4,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import ppo_gru
+import ppo_trxl
 
 torch.set_num_threads(1)  # the networks here are so small that threads would mostly wait for each other
 
@@ -14,13 +15,19 @@ def own_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
+SMALL = {
+    ppo_gru: {"hidden_size": 32},
+    ppo_trxl: {"trxl_dim": 32, "trxl_num_heads": 2, "trxl_num_layers": 2, "trxl_memory_length": 7},
+}
+
+
 @pytest.fixture
 def tiny():
-    """Arguments for a training of two short iterations; keyword arguments replace some of them."""
+    """Arguments of a script for a training of two short iterations; keyword arguments replace some of them."""
 
-    def make(**changes):
-        few = {"num_envs": 4, "num_steps": 16, "num_minibatches": 2, "update_epochs": 2, "hidden_size": 32}
-        return ppo_gru.Args(**{"cuda": False, "total_timesteps": 128, **few, **changes})
+    def make(script=ppo_gru, **changes):
+        few = {"num_envs": 4, "num_steps": 16, "num_minibatches": 2, "update_epochs": 2, **SMALL[script]}
+        return script.Args(**{"cuda": False, "total_timesteps": 128, **few, **changes})
 
     return make
 
@@ -41,14 +48,14 @@ def scalars():
 def played(tiny):
     """Set up an agent and play some rollouts, without learning; the last one stays in run.rollout."""
 
-    def play(iterations=1, weights_scale=1.0, **changes):
-        args = tiny(**changes)
-        run = ppo_gru.setup(args)
+    def play(iterations=1, weights_scale=1.0, script=ppo_gru, **changes):
+        args = tiny(script, **changes)
+        run = script.setup(args)
         with torch.no_grad():  # the initial policy hardly depends on its input; a test needs one that does
             for parameter in run.agent.heads.parameters():
                 parameter.mul_(weights_scale)
         for _ in range(iterations):
-            last_value, episodes = ppo_gru.collect(run.agent, run.envs, run.play, run.rollout, args, None)
+            last_value, episodes = script.collect(run.agent, run.envs, run.play, run.rollout, args, None)
         return args, run, last_value, episodes
 
     return play

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import ppo_gru
+import ppo_trxl
 
 SCRIPT = os.path.abspath(ppo_gru.__file__)
 CASES = {
@@ -37,14 +38,23 @@ CASES = {
 }
 
 
+TRANSFORMER_CASES = {
+    "--trxl-num-heads 5": "--trxl-dim is 384; it must be even and a multiple of --trxl-num-heads",
+    "--trxl-dim 9 --trxl-num-heads 3": "--trxl-dim is 9; it must be even",
+    "--trxl-memory-length 0": "--trxl-memory-length is 0; it must be 1 or more",
+    "--trxl-gate-bias inf": "--trxl-gate-bias is inf; it must be a finite number",
+    "--num-minibatches 200": "sure of only 128 segments to deal .* or a shorter --trxl-segment-length",
+}
+
+
 def run(flags, cwd):
     command = [sys.executable, SCRIPT, "--no-cuda", *flags]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
 
 
-def setup_error(args):
-    with pytest.raises((ValueError, OSError, ImportError, ppo_gru.gym.error.Error)) as error:
-        ppo_gru.setup(args)
+def setup_error(args, script=ppo_gru):
+    with pytest.raises((ValueError, OSError, ImportError, script.gym.error.Error)) as error:
+        script.setup(args)
     assert not os.path.exists("runs"), "nothing half-written"
     return str(error.value)
 
@@ -53,6 +63,12 @@ def setup_error(args):
 def test_setup_names_the_fault(line):
     message = setup_error(ppo_gru.tyro.cli(ppo_gru.Args, args=line.split()))
     assert re.search(CASES[line], message), message
+
+
+@pytest.mark.parametrize("line", TRANSFORMER_CASES)
+def test_setup_names_the_transformer_s_fault(line):
+    message = setup_error(ppo_trxl.tyro.cli(ppo_trxl.Args, args=line.split()), ppo_trxl)
+    assert re.search(TRANSFORMER_CASES[line], message), message
 
 
 @pytest.mark.parametrize("line", ["--env-id MortarMayhm-v0", '--env-options {"arena_size":9}', "--num-minibatches 64"])

@@ -75,4 +75,4 @@ def test_padded_length_is_the_longest_piece(seq_len, monkeypatch):
     assert seen == [(len(pieces.length), seq_len or 16, 4)], "the recurrent layers run once, padded no further"
     assert y.shape == (96, 4)
     padding = 1 - 96 / (len(pieces.length) * (seq_len or 16))
-    assert memory.padding_fraction(pieces) == pytest.approx(padding)
+    assert memory.numbers(pieces, torch.empty(0))["padding_fraction"] == pytest.approx(padding)

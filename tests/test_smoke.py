@@ -15,8 +15,15 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import ppo_gru
+import ppo_trxl
 
-SCRIPT = os.path.abspath(ppo_gru.__file__)
+SCRIPTS = [ppo_gru, ppo_trxl]
+MEMORIES = [
+    *({"memory": memory} for memory in ("gru", "lstm", "none")),
+    {"script": ppo_trxl},
+    {"script": ppo_trxl, "trxl_positional_encoding": "relative", "trxl_gate": "gru", "trxl_gate_bias": 2.0},
+    {"script": ppo_trxl, "trxl_positional_encoding": "learned", "trxl_init": "tfixup", "trxl_query_position": True},
+]
 CURVES = {
     "charts/SPS", "charts/learning_rate", "charts/entropy_coefficient", "charts/padding_fraction",
     "losses/policy_loss", "losses/value_loss", "losses/entropy", "losses/loss", "losses/approx_kl",
@@ -50,10 +57,11 @@ class Image(gym.Env):
 gym.register("Image-v0", entry_point=Image)
 
 
-@pytest.mark.parametrize("memory", ["gru", "lstm", "none"])
+@pytest.mark.parametrize("memory", MEMORIES)
 @pytest.mark.parametrize("env_id", ["MortarMayhem-Grid-v0", "MortarMayhemB-v0", "CartPole-v1", "Image-v0"])
 def test_trains(tiny, scalars, env_id, memory):
-    curves = scalars(ppo_gru.main(tiny(env_id=env_id, memory=memory, num_steps=32, total_timesteps=256)))
+    script = memory.get("script", ppo_gru)
+    curves = scalars(script.main(tiny(env_id=env_id, num_steps=32, total_timesteps=256, **memory)))
     assert curves.keys() >= CURVES
     assert all(math.isfinite(value) for name in CURVES for value in curves[name])
     assert all(error < 1e-5 for error in curves["losses/ratio_error"])
@@ -92,9 +100,10 @@ def test_episodes_are_counted_across_rollouts(played):
     assert episodes["charts/episodic_return"] == episodes["episode/right"]
 
 
-def test_same_seed_same_curves(tiny, scalars):
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_same_seed_same_curves(tiny, scalars, script):
     first, second, other = (
-        scalars(ppo_gru.main(tiny(env_id="MortarMayhemB-Grid-v0", exp_name=name, seed=seed)))
+        scalars(script.main(tiny(script, env_id="MortarMayhemB-Grid-v0", exp_name=name, seed=seed)))
         for name, seed in (("a", 1), ("b", 1), ("c", 2))
     )
     for name in first.keys() - {"charts/SPS"}:
@@ -179,13 +188,20 @@ def test_logged_divergences(played):
     assert logs["losses/ratio_error"].item() == pytest.approx(math.exp(0.2) - 1, abs=1e-5)
 
 
-def test_save_and_load(tiny):
-    folder = ppo_gru.main(tiny(env_id="CueRecall-v0", save_model=True, memory="lstm"))
+def test_the_transformer_logs_the_window_in_use(tiny, scalars):
+    curves = scalars(ppo_trxl.main(tiny(ppo_trxl, env_id="CueRecall-v0", trxl_memory_length=100)))
+    assert 11 <= max(curves["charts/memory_window"]) <= 13, "the longest episode's, not 100"
+
+
+@pytest.mark.parametrize("memory", [{"script": ppo_trxl, "trxl_gate": "gru"}, {"memory": "lstm"}])
+def test_save_and_load(tiny, memory):
+    script = memory.get("script", ppo_gru)
+    folder = script.main(tiny(env_id="CueRecall-v0", save_model=True, **memory))
     path = os.path.join(folder, "model.pt")
-    args, weights = ppo_gru.load_model(path)
-    assert args == tiny(env_id="CueRecall-v0", save_model=True, memory="lstm")
+    args, weights = script.load_model(path)
+    assert args == tiny(env_id="CueRecall-v0", save_model=True, **memory)
     assert all(weight.device.type == "cpu" for weight in weights.values())
-    run = ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path, memory="lstm", exp_name="again", seed=9))
+    run = script.setup(tiny(env_id="CueRecall-v0", load_model=path, exp_name="again", seed=9, **memory))
     for name, weight in run.agent.state_dict().items():
         assert weight.equal(weights[name])
     assert [name for name in os.listdir(folder) if name.startswith("model")] == ["model.pt"]
@@ -199,26 +215,29 @@ def test_capture_video(tiny):
     assert all(os.path.getsize(video) > 1000 for video in videos)
 
 
-def test_command_line(tmp_path):
+@pytest.mark.parametrize(("script", "width"), [(ppo_gru, "--hidden-size"), (ppo_trxl, "--trxl-dim")])
+def test_command_line(tmp_path, script, width):
     flags = "--env-id MortarMayhem-Grid-v0 --total-timesteps 128 --num-envs 2 --num-steps 64 --num-minibatches 2"
-    command = [sys.executable, SCRIPT, *flags.split(), "--hidden-size", "16", "--no-cuda", "--save-model"]
+    command = [sys.executable, script.__file__, *flags.split(), width, "16", "--no-cuda", "--save-model"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert re.search(r"return=-?\d.*length=\d.*SPS=\d", done.stderr), "the progress bar"
     (folder,) = (tmp_path / "runs").iterdir()
-    assert folder.name.startswith("MortarMayhem-Grid-v0__ppo_gru__1__")
+    assert folder.name.startswith(f"MortarMayhem-Grid-v0__{script.__name__}__1__")
     assert (folder / "model.pt").exists()
 
 
-def test_the_script_needs_no_extra():
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_the_script_needs_no_extra(script):
     """What only an extra brings must not be imported with the script."""
     extras = ("moviepy", "wandb", "pygame", "matplotlib", "pytest")
-    code = f"import sys; sys.modules.update(dict.fromkeys({extras})); import ppo_gru"
-    subprocess.run([sys.executable, "-c", code], cwd=os.path.dirname(SCRIPT), check=True, timeout=300)
+    code = f"import sys; sys.modules.update(dict.fromkeys({extras})); import {script.__name__}"
+    subprocess.run([sys.executable, "-c", code], cwd=os.path.dirname(script.__file__), check=True, timeout=300)
 
 
-def test_help():
-    shown = subprocess.run([sys.executable, SCRIPT, "--help"], capture_output=True, text=True, timeout=300)
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_help(script):
+    shown = subprocess.run([sys.executable, script.__file__, "--help"], capture_output=True, text=True, timeout=300)
     assert shown.returncode == 0
-    for name in ppo_gru.Args.__dataclass_fields__:
-        assert f"{ppo_gru.flag(name)}" in shown.stdout
+    for name in script.Args.__dataclass_fields__:
+        assert f"{script.flag(name)}" in shown.stdout

@@ -1,11 +1,15 @@
-"""Lane i of N is a single environment with its seed: same levels, same rules, same pictures, resets included."""
+"""Lane i of N is a single environment with its seed: what a vector environment returns is what Gymnasium's own returns.
+
+`SyncVectorEnv` in the same-step mode steps single environments one by one. Ours has to agree with it key by key.
+"""
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from helpers import EACH_OBS, HASTY, check_same, lane_of, make, roll
 from players import FAMILY, stumbling
 
-import memory_gym_envs
 from memory_gym_envs import MortarMayhem, MysteryPath, SearingSpotlights
 
 LANES = 5
@@ -29,14 +33,39 @@ CHANGED = {
 }
 
 
-def same(left, right) -> bool:
-    if isinstance(left, dict):
-        return left.keys() == right.keys() and all(same(left[key], right[key]) for key in left)
-    return np.array_equal(left, right)
+class Told(gym.Wrapper):
+    """A single environment that is reset with the same options until it is told others.
+
+    Automatic resets of ours keep the options, and those of SyncVectorEnv give none.
+    """
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.options = None
+
+    def reset(self, *, seed=None, options=None):
+        return self.env.reset(seed=seed, options=self.options)
 
 
-def lane_of(observations, lane):
-    return {k: v[lane] for k, v in observations.items()} if isinstance(observations, dict) else observations[lane]
+def gymnasiums_own(env_id, **arguments):
+    return SyncVectorEnv(
+        [lambda: Told(gym.make(env_id, disable_env_checker=True, **arguments))] * LANES,
+        autoreset_mode=AutoresetMode.SAME_STEP,
+    )
+
+
+def reset_both(ours, theirs, seed, options, mask=None):
+    """The same explicit reset of both, whose results must agree."""
+    lanes = range(LANES) if mask is None else np.flatnonzero(mask)
+    for lane in lanes:
+        theirs.envs[lane].options = options
+    # A dictionary for each, as SyncVectorEnv takes the mask out.
+    results = [envs.reset(seed=seed, options=masked(options, mask)) for envs in (ours, theirs)]
+    check_same(*results)
+
+
+def masked(options, mask):
+    return options if mask is None else {**(options or {}), "reset_mask": mask}
 
 
 def mixed_actions(envs, rng) -> np.ndarray:
@@ -44,42 +73,65 @@ def mixed_actions(envs, rng) -> np.ndarray:
     return stumbling(envs, rng, np.linspace(0.1, 1.0, envs.num_envs))
 
 
-@pytest.mark.parametrize("num_levels", [None, 3])
-@pytest.mark.parametrize("env_id", memory_gym_envs.IDS)
-@pytest.mark.parametrize("changed", [False, True], ids=["default", "options"])
-def test_lane_equals_single(env_id, changed, num_levels):
-    levels = {"num_levels": num_levels, "start_level": 40} if num_levels else {}
-    envs = gym.make_vec(env_id, num_envs=LANES, **levels)
-    singles = [gym.make(env_id, **levels).unwrapped for _ in range(LANES)]
-    options = OPTIONS[env_id] if changed else None
-    observations, infos = envs.reset(seed=11, options=options)
-    for lane, single in enumerate(singles):
-        observation, info = single.reset(seed=11 + lane, options=options)
-        assert same(observation, lane_of(observations, lane))
-        assert same(info["ground_truth"], infos["ground_truth"][lane])
+@EACH_OBS
+@pytest.mark.parametrize("levels", [{}, {"num_levels": 3, "start_level": 40}], ids=["any level", "3 levels"])
+def test_as_gymnasiums_own(env_id, obs_type, levels):
+    """Explicit resets of every kind, and some hundred steps with automatic ones between them."""
+    ours = gym.make_vec(env_id, num_envs=LANES, obs_type=obs_type, **levels)
+    theirs = gymnasiums_own(env_id, obs_type=obs_type, **levels)
+    options, changed = OPTIONS[env_id], CHANGED[FAMILY[env_id]]
+    resets = [
+        (11, None, None),
+        ([5, None, 6, None, 0], options, None),
+        (None, changed, np.array([True, False, False, True, False])),
+        ([None, 7, 8, 9, None], None, np.array([False, True, False, False, True])),
+        (None, None, None),
+    ]
     rng, ended = np.random.default_rng(0), 0
-    for _ in range(200):
-        actions = mixed_actions(envs, rng)
-        observations, rewards, terminated, truncated, infos = envs.step(actions)
-        for lane, single in enumerate(singles):
-            action = actions[lane] if actions.ndim > 1 else int(actions[lane])
-            observation, reward, over, cut, info = single.step(action)
-            assert (reward, over, cut) == (rewards[lane], terminated[lane], truncated[lane])
-            if over or cut:
-                ended += 1
-                assert same(observation, infos["final_obs"][lane])
-                final = {key: infos["final_info"][key][lane] for key in info}
-                assert same(info, final)
-                # An automatic reset keeps the options; the single environment is told them again.
-                observation, info = single.reset(options=options)
-            assert same(observation, lane_of(observations, lane))
-            assert same(info["ground_truth"], infos["ground_truth"][lane])
-    assert ended > 2
+    for seed, given, mask in resets:
+        reset_both(ours, theirs, seed, given, mask)
+        for _ in range(80):
+            actions = mixed_actions(ours, rng)
+            result = ours.step(actions)
+            check_same(result, theirs.step(actions))
+            ended += np.count_nonzero(result[2] | result[3])
+        for lane in range(LANES):
+            assert ours.np_random_seed[lane] == theirs.np_random_seed[lane]
+            assert ours.np_random[lane].bit_generator.state == theirs.np_random[lane].bit_generator.state
+    assert ended > LANES
 
 
-@pytest.mark.parametrize("env_id", memory_gym_envs.IDS)
-def test_reset_mask_resets_only_its_lanes(env_id):
-    envs, twin = (gym.make_vec(env_id, num_envs=4) for _ in range(2))
+@EACH_OBS
+def test_ended_episodes(env_id, obs_type):
+    """Every step belongs to an episode, and the masks say whose has ended."""
+    envs = make(env_id, obs_type=obs_type)
+    envs.reset(seed=0, options=HASTY[FAMILY[env_id]])
+    lengths, rewards, ends = np.zeros(envs.num_envs, int), np.zeros(envs.num_envs), 0
+    for _, reward, terminated, truncated, infos in roll(envs, 200):
+        lengths, rewards = lengths + 1, rewards + reward
+        assert infos["_ground_truth"].all()
+        ended = terminated | truncated
+        if not ended.any():
+            assert infos.keys() == {"ground_truth", "_ground_truth"}
+            continue
+        final, masks = infos["final_info"], [infos["_final_obs"], infos["_final_info"]]
+        names = {key for key in final if not key.startswith("_")}
+        assert names >= {"reward", "length", "ground_truth"}
+        for mask in [*masks, *(final[f"_{name}"] for name in names)]:
+            assert mask.dtype == bool
+            assert np.array_equal(mask, ended)
+        assert not any(final[name][~ended].any() for name in names)
+        for lane, observation in enumerate(infos["final_obs"]):
+            assert observation in envs.single_observation_space if ended[lane] else observation is None
+        assert np.array_equal(final["length"][ended], lengths[ended])
+        np.testing.assert_allclose(final["reward"][ended], rewards[ended])
+        lengths[ended], rewards[ended], ends = 0, 0.0, ends + np.count_nonzero(ended)
+    assert ends > 2 * envs.num_envs
+
+
+@EACH_OBS
+def test_reset_mask_resets_only_its_lanes(env_id, obs_type):
+    envs, twin = make(env_id, obs_type=obs_type), make(env_id, obs_type=obs_type)
     before, _ = envs.reset(seed=1)
     twin.reset(seed=1)
     rng = np.random.default_rng(1)
@@ -87,17 +139,12 @@ def test_reset_mask_resets_only_its_lanes(env_id):
         actions = mixed_actions(envs, rng)
         before, *_ = envs.step(actions)
         twin.step(actions)
-    mask = np.array([False, True, False, True])
-    changed = CHANGED[FAMILY[env_id]]
+    mask, changed = np.array([False, True, False, True]), CHANGED[FAMILY[env_id]]
     options = {"reset_mask": mask, **changed}
     after, infos = envs.reset(seed=[None, 7, None, 8], options=options)
     assert list(options) == ["reset_mask", *changed]  # the caller's dictionary is untouched
-    single = gym.make(env_id)
-    for lane, level in ((1, 7), (3, 8)):
-        fresh, _ = single.reset(seed=level, options=changed)
-        assert same(lane_of(after, lane), fresh)
     for lane in (0, 2):
-        assert same(lane_of(after, lane), lane_of(before, lane))
+        check_same(lane_of(after, lane), lane_of(before, lane))
     assert infos["_ground_truth"].tolist() == mask.tolist()
     assert not infos["ground_truth"][~mask].any()
     # Lanes 0 and 2 go on as if nothing had happened, with their own options, and the others with the new ones.
@@ -105,7 +152,7 @@ def test_reset_mask_resets_only_its_lanes(env_id):
         actions = mixed_actions(envs, rng)
         ours, theirs = envs.step(actions), twin.step(actions)
         for lane in (0, 2):
-            assert same(lane_of(ours[0], lane), lane_of(theirs[0], lane))
+            check_same(lane_of(ours[0], lane), lane_of(theirs[0], lane))
             assert [part[lane] for part in ours[1:4]] == [part[lane] for part in theirs[1:4]]
     assert envs.settings == [envs.defaults, envs.resolve(changed)] * 2
 

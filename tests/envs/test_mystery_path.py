@@ -8,8 +8,8 @@ import pytest
 from players import player, stumbling, turn_or_walk
 
 from memory_gym_envs import MysteryPath
+from memory_gym_envs.character import BODY, PAD
 from memory_gym_envs.mystery_path import (
-    AGAIN,
     BEYOND,
     EAST,
     FIRST_SEGMENTS,
@@ -20,10 +20,9 @@ from memory_gym_envs.mystery_path import (
     SIDE,
     SOUTH,
     TILE,
-    WALL_WORDS,
     WEST,
-    Tape,
     draw_segments,
+    read_ahead,
     trail,
 )
 
@@ -96,7 +95,7 @@ def test_endless_paths_are_joined_by_transition_tiles():
 
 def further(rng, *arguments):
     """The endless path's next segments from this generator."""
-    tape = Tape(rng, FIRST_SEGMENTS)
+    tape = read_ahead(rng, FIRST_SEGMENTS)
     level = draw_segments(tape, *arguments)
     tape.close()
     return level
@@ -118,32 +117,6 @@ def test_endless_path_grows_when_its_last_segment_is_entered():
     assert s.segments[0] > 8
     assert s.cell[0, 1 : s.count[0] + 1].tolist() == level.path
     check_path(s, path_of(s))
-
-
-def test_tape_draws_what_the_generator_would():
-    for seed in range(20):
-        ahead, one_by_one = np.random.default_rng(seed), np.random.default_rng(seed)
-        if seed % 2:  # half of a 64-bit word is left over
-            ahead.integers(0, 7)
-            one_by_one.integers(0, 7)
-        tape = Tape(ahead, 4)
-        limits = [1, 2, 7, 8, 100, 2**31 + 1] * 30
-        drawn = []
-        for limit in limits:
-            drawn.append(tape.below(limit))
-        tape.close()
-        assert drawn == [one_by_one.integers(0, limit) for limit in limits]
-        assert ahead.bit_generator.state == one_by_one.bit_generator.state
-
-
-def test_tape_finds_the_words_that_are_drawn_again():
-    tape = Tape(np.random.default_rng(0), 1)
-    twin = Tape(np.random.default_rng(0), 1)
-    for word in (*AGAIN, WALL_WORDS - 1, WALL_WORDS, 0, 2**32 - 1):
-        for each in (tape, twin):
-            each.used, each.words[3] = 0, word
-        assert tape.chances(8) == [twin.below(100) < 33 for _ in range(8)]
-        assert tape.used == twin.used == 8 + (word in AGAIN)
 
 
 # ---- falling off ----
@@ -211,6 +184,17 @@ def test_large_agents_start_beside_the_origin(scale):
     beside = int(25 * scale) // TILE
     assert s.tile[0].tolist() == [column + beside, row + beside]
     assert env.batch.reset(options={"agent_scale": scale})[0] in env.batch.observation_space
+
+
+@pytest.mark.parametrize("speed", [14, 15, 16, 17, 84])
+def test_the_largest_agent_leaves_the_screen_at_any_speed(speed):
+    env, s = made(ENDLESS, 7, agent_scale=1.0, agent_speed=speed)
+    assert path_of(s)[0] == (0, SIDE - 1)  # the bottom row, from which the agent walks down
+    frame, *_ = env.step(3)
+    assert s.pos[0, 1] == (SIDE - 1) * TILE + 25 + speed + PAD
+    assert not has(frame, BODY)
+    frame, *_ = env.step(3)
+    assert has(frame, BODY)
 
 
 # ---- endless episodes ----
@@ -380,14 +364,15 @@ def test_debug_render_shows_the_path(env_id):
         assert frame.dtype == np.uint8
         offset = s.pos[0, 0] - s.origin[0, 0] - 60 if endless else 0
         path = path_of(s)
-        kinds = dict.fromkeys(path, WHITE) | {path[0]: BLUE} | ({} if endless else {path[-1]: GREEN})
+        kinds = {place: BLUE if place[0] % SEGMENT == SIDE else WHITE for place in path}
+        kinds |= {path[0]: BLUE} | ({} if endless else {path[-1]: GREEN})
         for segment, walls in enumerate(s.walls[0]):
             places = [divmod(place, SIDE) for place in walls]
             kinds |= {(column + SEGMENT * segment, row): RED for column, row in places}
         shown = 0
         for (column, row), color in kinds.items():
             x, y = 4 * (column * TILE - offset), 4 * row * TILE
-            seen = tuple(frame[y + 2, x + 2].tolist()) if 0 <= x < 336 else None
+            seen = tuple(frame[y + 6, x + 6].tolist()) if 0 <= x < 330 else None
             if seen in (GREEN, BLUE, RED, WHITE):  # not the agent
                 assert seen == color
                 shown += 1

@@ -1,0 +1,113 @@
+"""What a frame tells of the agent: where it is and which way it faces, as far as nothing hides it.
+
+The screen's edge, a symbol or a cross may hide so much of an agent that several places and facings look the same. The
+tables made here say which, so that a vector observation knows no more than who sees the frame.
+Shape letters: R sprites (the facings of all views), W a sprite's width, P stored positions along one axis, n agents.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from memory_gym_envs.character import FACINGS, PAD, SPAN, radius_of
+from memory_gym_envs.drawing import SCREEN
+from memory_gym_envs.entries import Entries
+
+LARGEST = radius_of(1.0)
+UNSEEN = SPAN  # the position of an agent of which nothing shows, and its size
+# What entries say, by their code: stored positions, then UNSEEN, then sizes.
+VALUES = np.concatenate([(np.arange(SPAN) - PAD) / SCREEN, np.arange(1 + LARGEST) / LARGEST]).astype(np.float32)
+FLAGS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little").astype(np.float32)
+NOTHING = (UNSEEN, UNSEEN, UNSEEN, 0)  # the codes
+PLACE_STRIDES = np.array([1, SPAN])
+
+
+def agent_entries(low: int, high: int) -> tuple[Entries, ...]:
+    """The entries that `look` writes, for agents whose centre stays between these pixels on both axes."""
+    size = f"radius of the agent's body, / {LARGEST} pixels; 0: nothing of the agent shows"
+    place = "the agent's centre, x and y, / 84 pixels; where several would look the same, their middle"
+    facing = "1 for each direction that the agent faces by its looks: up, up-left, left, ..., up-right"
+    ends = min(low / SCREEN, 0.0), high / SCREEN
+    return Entries("size", 1, size), Entries("place", 2, place, *ends), Entries("facing", FACINGS, facing)
+
+
+class View(NamedTuple):
+    """An agent of one size, where it may be, and what lies over it."""
+
+    scale: float
+    image: np.ndarray  # (FACINGS, W, W, 3) uint8: the agent, with what moves with it
+    solid: np.ndarray  # (FACINGS, W, W) bool: what of that is drawn
+    free: np.ndarray  # (SCREEN, SCREEN) bool: where nothing lies over it
+    columns: range  # where its centre may be, stored positions along x
+    rows: range  # and along y
+
+
+class Looks(NamedTuple):
+    """The tables of all views in use, stacked: row view * FACINGS + facing is a sprite's."""
+
+    seen: np.ndarray  # (R * P * P, 4) uint8: codes of size, x and y, and the facings as bits
+    solid: np.ndarray  # (R, W + 2, W + 2) bool: the sprites with a transparent rim
+
+
+def make_looks(views: list[View]) -> Looks:
+    """Prepares the views."""
+    width = max(view.solid.shape[1] for view in views) + 2
+    solids = []
+    for view in views:
+        margin = (width - view.solid.shape[1]) // 2
+        solids.append(np.pad(view.solid, ((0, 0), (margin, margin), (margin, margin))))
+    return Looks(np.concatenate([see(view) for view in views]), np.concatenate(solids))
+
+
+def see(view: View) -> np.ndarray:
+    """(FACINGS * P * P, 4) uint8: Looks.seen of one view. What looks the same has the same codes."""
+    prints = fingerprints(view)
+    _, kind = np.unique(prints, return_inverse=True)
+    kind = kind.reshape(-1)
+    facing, y, x = (index.reshape(-1) for index in np.indices(prints.shape))
+    alike, count = np.zeros((kind.max() + 1, FACINGS), bool), np.bincount(kind)
+    alike[kind, facing] = True
+    column, row = (np.rint(np.bincount(kind, place) / count) for place in (x, y))
+    size, facings = np.full_like(count, UNSEEN + radius_of(view.scale)), np.packbits(alike, axis=1, bitorder="little")
+    codes = np.column_stack([size, column + view.columns.start, row + view.rows.start, facings]).astype(np.uint8)
+    codes[kind[prints.reshape(-1) == 0]] = NOTHING
+    table = np.full((FACINGS, SPAN, SPAN, len(NOTHING)), NOTHING, np.uint8)
+    reach = (slice(None), slice(view.rows.start, view.rows.stop), slice(view.columns.start, view.columns.stop))
+    table[reach] = codes[kind].reshape(*prints.shape, len(NOTHING))
+    return table.reshape(-1, len(NOTHING))
+
+
+def fingerprints(view: View) -> np.ndarray:
+    """(FACINGS, rows, columns) uint64: numbers that differ where the agents look different; 0 where nothing shows.
+
+    The sum over all pixels that show of their colour times their place on the screen, a random number. So two pictures
+    have the same number by a chance of one in 2**64.
+    """
+    color = (view.image.astype(np.uint64) @ np.array([1 << 16, 1 << 8, 1], np.uint64) + 1) * view.solid
+    # Along a row of equal pixels the sum is the difference of two partial sums, so that only edges count.
+    edges = -np.diff(color, axis=2, prepend=np.uint64(0), append=np.uint64(0))  # (FACINGS, W, W + 1)
+    width = color.shape[1]
+    place = np.random.default_rng(0).integers(0, 1 << 64, (SCREEN, SCREEN), np.uint64) * view.free
+    before = PAD + width // 2
+    place = np.pad(place, (before, width + SPAN - before - SCREEN))
+    sums = np.pad(np.cumsum(place, axis=1), ((0, 0), (1, 0)))
+    rows, columns = view.rows, view.columns
+    prints = np.zeros((FACINGS, len(rows), len(columns)), np.uint64)
+    for facing, row, column in np.argwhere(edges):
+        reach = sums[rows.start + row : rows.stop + row, columns.start + column : columns.stop + column]
+        prints[facing] += edges[facing, row, column] * reach
+    return prints
+
+
+def look(out: np.ndarray, looks: Looks, sprite: np.ndarray, pos: np.ndarray) -> None:
+    """Writes the entries of the agents with these sprites (n,) at these positions (n, 2) to out, (n, 11)."""
+    seen = looks.seen.take(sprite * (SPAN * SPAN) + pos.dot(PLACE_STRIDES), axis=0)  # (n, 4)
+    out[:, :3] = VALUES.take(seen[:, :3])
+    out[:, 3:] = FLAGS.take(seen[:, 3], axis=0)
+
+
+def covered(looks: Looks, sprite: np.ndarray, pos: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Which pixels lie under the agents: (n, k) bool for points (n, k, 2), x and y with PAD."""
+    width = looks.solid.shape[1]
+    place = (points - pos[:, None] + width // 2).clip(0, width - 1)
+    return looks.solid[sprite[:, None], place[..., 1], place[..., 0]]

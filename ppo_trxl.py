@@ -1,0 +1,1172 @@
+"""PPO that remembers with a Transformer-XL: an episodic memory seen through a sliding window.
+
+    python ppo_trxl.py --env-id MortarMayhem-Grid-v0
+
+The agent sees one observation at a time. Every step leaves behind an item in the episodic memory: the inputs of the
+transformer's blocks. Each block of a later step attends to the items of the last --trxl-memory-length steps of the
+episode. An item is stored as it was and passes no gradient: it was computed with the weights of the time.
+
+An item becomes a key and a value once, not once for every window that it is in. While the agent plays, both are kept in
+a cache, made anew after each update. To learn, the rollout of a lane and the window before it form a timeline, which is
+cut into segments of --trxl-segment-length steps; a segment's queries attend to its own items and the window before it
+through one mask, which lets each query see the steps before its own, of the same episode, as far as the window reaches.
+
+After chapter 5 of "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", called the thesis
+below; numbers in brackets are its equations, defaults are the "Final" column of its table 6.1. Only section 5 knows
+which memory this is.
+
+Shape letters: T steps of a rollout, N lanes (environments in parallel), A action branches, R steps of a minibatch,
+S segments of a minibatch, L steps of the longest, W window, M items that a segment looks at, K blocks, H heads,
+D width of the memory.
+"""
+
+import contextlib
+import importlib
+import itertools
+import json
+import math
+import os
+import sys
+import time
+from collections import defaultdict, deque
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+import torch
+import torch.nn.functional as F
+import tyro
+from gymnasium.vector import AutoresetMode
+from torch import Tensor, nn
+from torch.distributions import Categorical
+from torch.nn.utils.rnn import pad_sequence
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+import memory_gym_envs  # noqa: F401 (registers the Memory Gym ids)
+
+
+# ---- 1 ARGS ----
+@dataclass
+class Args:
+    """Train a PPO agent with a Transformer-XL memory."""
+
+    exp_name: str = "ppo_trxl"
+    """name of the experiment, part of the run folder's name"""
+    seed: int = 1
+    """seed of the weights, the actions and the environments: same seed, same curves (on the CPU to the last bit)"""
+    torch_deterministic: bool = True
+    """ask cuDNN for deterministic algorithms"""
+    cuda: bool = True
+    """train on the GPU when there is one"""
+    track: bool = False
+    """log to Weights and Biases too (needs the extra `track`)"""
+    wandb_project_name: str = "memory-gym-baselines"
+    """the project's name at Weights and Biases"""
+    wandb_entity: str | None = None
+    """the team's name at Weights and Biases"""
+    capture_video: bool = False
+    """record some episodes of lane 0 to the run folder (needs the extra `play`)"""
+    save_model: bool = False
+    """write weights and arguments to model.pt in the run folder when training ends"""
+    load_model: str | None = None
+    """start from the weights in this file, written by --save-model"""
+
+    env_id: str = "MortarMayhem-Grid-v0"
+    """any Gymnasium id with Discrete or MultiDiscrete actions and pixels, vectors or a Dict of them as observation"""
+    env_options: str = "{}"
+    """reset parameters of a Memory Gym environment as JSON, e.g. '{"command_count": [4]}'"""
+    num_levels: int = 100_000
+    """how many levels a Memory Gym environment trains on (0: no limit)"""
+    start_level: int = 0
+    """the first of these levels"""
+
+    total_timesteps: int = 163_840_000
+    """steps to train for, all lanes together, rounded down to whole iterations of num_envs x num_steps"""
+    num_envs: int = 32
+    """lanes: environments that play in parallel"""
+    num_steps: int = 512
+    """steps of each lane in one rollout"""
+    num_minibatches: int = 8
+    """minibatches of an epoch"""
+    update_epochs: int = 3
+    """how often each rollout is learned from"""
+    gamma: float = 0.995
+    """discount factor"""
+    gae_lambda: float = 0.95
+    """lambda of generalized advantage estimation"""
+    bootstrap_truncated: bool = False
+    """value the final observation of an episode that a time limit cut short, instead of counting it as ended"""
+    norm_adv: bool = False
+    """normalize the advantages of each minibatch"""
+    clip_coef: float = 0.1
+    """how far the probability ratio, and the value, may move from the rollout's"""
+    clip_vloss: bool = True
+    """clip the value loss too"""
+    vf_coef: float = 0.5
+    """weight of the value loss"""
+    max_grad_norm: float = 0.25
+    """the gradient is scaled down to this norm"""
+    target_kl: float | None = None
+    """end an iteration's learning after the epoch whose mean KL divergence exceeds this"""
+    init_lr: float = 2.75e-4
+    """learning rate at the first step"""
+    final_lr: float = 1.0e-5
+    """learning rate from step --anneal-steps on"""
+    init_ent_coef: float = 1.0e-4
+    """weight of the entropy bonus at the first step"""
+    final_ent_coef: float = 1.0e-6
+    """weight of the entropy bonus from step --anneal-steps on"""
+    anneal_steps: int = 163_840_000
+    """steps over which both decay linearly (0: both keep their initial values)"""
+
+    trxl_num_layers: int = 3
+    """blocks of the transformer"""
+    trxl_num_heads: int = 4
+    """attention heads of a block"""
+    trxl_dim: int = 384
+    """width of the blocks"""
+    trxl_memory_length: int = 256
+    """window: how many steps an agent looks back at, at most (never further than its episode's first)"""
+    trxl_positional_encoding: Literal["absolute", "learned", "relative", "none"] = "absolute"
+    """what tells the order of the steps that are looked back at"""
+    trxl_query_position: bool = False
+    """tell the first block's query its own step too"""
+    trxl_pe_length: int = 2048
+    """longest episode that a learned encoding is made for"""
+    trxl_segment_length: int = 128
+    """steps that are learned from at once, of one lane; any length computes the same"""
+    trxl_init: Literal["xavier", "orthogonal", "kaiming", "tfixup"] = "xavier"
+    """how the blocks' weights are initialized"""
+    trxl_gate: Literal["none", "gru"] = "none"
+    """what merges a layer's output with its input: residual connections (TrXL) or gates (GTrXL)"""
+    trxl_gate_bias: float = 0.0
+    """above 0 a gate holds on to its input at first"""
+
+
+def flag(name: str) -> str:
+    """Return the command line's spelling of a field of Args."""
+    return "--" + name.replace("_", "-")
+
+
+def check_args(args: Args) -> None:
+    """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work."""
+    integers = [("num_levels", 0), ("start_level", 0), ("anneal_steps", 0), ("seed", 0)]
+    integers += [(name, 1) for name in ("num_envs", "num_steps", "num_minibatches", "update_epochs")]
+    integers += [(name, 1) for name in ("total_timesteps", "trxl_num_layers", "trxl_num_heads", "trxl_dim")]
+    integers += [(name, 1) for name in ("trxl_memory_length", "trxl_pe_length", "trxl_segment_length")]
+    numbers = [("gamma", 0, 1), ("gae_lambda", 0, 1)]
+    numbers += [(name, 0, math.inf) for name in ("vf_coef", "init_lr", "final_lr", "init_ent_coef", "final_ent_coef")]
+    for name, low in integers:
+        if not low <= getattr(args, name) < 2**63:
+            raise ValueError(f"{flag(name)} is {getattr(args, name)}; it must be {low} or more (and below 2 ** 63)")
+    for name, low, high in numbers:
+        if not low <= getattr(args, name) <= high or not math.isfinite(getattr(args, name)):
+            raise ValueError(f"{flag(name)} is {getattr(args, name)}; it must be a number from {low} to {high}")
+    for name in ("clip_coef", "max_grad_norm", "target_kl"):
+        value = getattr(args, name)
+        if value is not None and not value > 0:
+            raise ValueError(f"{flag(name)} is {value}; it must be above 0")
+    if not args.exp_name or set(args.exp_name) & set("/\\"):
+        raise ValueError(f"--exp-name is {args.exp_name!r}; it must be a name without slashes")
+    batch_size = args.num_envs * args.num_steps
+    if args.total_timesteps < batch_size:
+        raise ValueError(
+            f"--total-timesteps is {args.total_timesteps}, less than one iteration of {batch_size} steps "
+            f"(--num-envs {args.num_envs} x --num-steps {args.num_steps})"
+        )
+    if args.trxl_dim % args.trxl_num_heads or args.trxl_dim % 2:
+        raise ValueError(f"--trxl-dim is {args.trxl_dim}; it must be even and a multiple of --trxl-num-heads")
+    if not math.isfinite(args.trxl_gate_bias):
+        raise ValueError(f"--trxl-gate-bias is {args.trxl_gate_bias}; it must be a finite number")
+    longest = min(args.trxl_segment_length, args.num_steps)
+    if args.num_minibatches * longest > batch_size:
+        raise ValueError(
+            f"--num-minibatches is {args.num_minibatches}, but an iteration is sure of only {batch_size // longest} "
+            f"segments to deal (up to {longest} of {batch_size} steps each); use that many or a shorter "
+            "--trxl-segment-length"
+        )
+
+
+# ---- 2 ENVIRONMENTS ----
+def make_envs(env_id: str, num_envs: int, num_levels: int, start_level: int, video: bool) -> gym.vector.VectorEnv:
+    """Make a vector environment with same-step autoreset: an ended lane's next observation begins a new episode.
+
+    Uses the id's own vector entry point where that resets in the same step, else Gymnasium's synchronous one. With
+    video, render() returns a picture a lane. Raises gymnasium.error.Error for an unknown id, ImportError for a missing
+    package or module, ValueError for wrong levels.
+    """
+    module, _, name = env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    levels = is_memory_gym(name)
+    kwargs = {"num_levels": num_levels, "start_level": start_level} if levels else {}
+    if video:
+        kwargs["render_mode"] = "debug_rgb_array" if levels else "rgb_array"
+    same_step = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    try:
+        if gym.spec(name).vector_entry_point is not None:
+            envs = gym.make_vec(name, num_envs, **kwargs)
+            if envs.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:
+                return envs
+            envs.close()
+        return gym.make_vec(name, num_envs, vectorization_mode="sync", vector_kwargs=same_step, **kwargs)
+    except TypeError as error:  # what a constructor says of an argument that it does not take
+        raise ValueError(f"{env_id} cannot be made: {error}") from None
+
+
+def is_memory_gym(env_id: str) -> bool:
+    """Tell whether the id is one of this repository's environments, which have levels and reset parameters."""
+    return str(gym.spec(env_id.rpartition(":")[2]).entry_point).startswith("memory_gym_envs")
+
+
+def reset_options(env_id: str, env_options: str) -> dict | None:
+    """Parse --env-options; raise ValueError if it is no JSON object or the environment has no such parameters."""
+    try:
+        options = json.loads(env_options)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"--env-options is no JSON ({error}): {env_options}") from None
+    if not isinstance(options, dict):
+        raise ValueError(f'--env-options must be a JSON object such as {{"visual_feedback": false}}, not {env_options}')
+    if options and not is_memory_gym(env_id):
+        raise ValueError(f"--env-options are reset parameters of Memory Gym environments; {env_id} has none")
+    return options or None
+
+
+def first_reset(envs: gym.vector.VectorEnv, seed: int, options: dict | None) -> dict[str, Tensor]:
+    """Seed every lane with its own stream, then begin each lane's first episode; return its observations (N, ...).
+
+    Raises ValueError for a reset parameter that the environment does not have or allow.
+    """
+    # Neighbouring run seeds must not share lanes, so the lanes' seeds count up from a hash of the run's seed.
+    envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]), options=options)
+    # An explicit seed is a level of its own; from here on the levels come from the training set.
+    obs, _ = envs.reset(options=options)
+    return as_tensors(obs)
+
+
+def observation_spaces(space: gym.Space) -> dict[str, gym.spaces.Box]:
+    """Name the parts of an observation; raise ValueError for a space that the encoder has no layer for."""
+    parts = dict(space.spaces) if isinstance(space, gym.spaces.Dict) else {"observation": space}
+    for name, part in parts.items():
+        pixels = isinstance(part, gym.spaces.Box) and len(part.shape) == 3 and min(part.shape[:2]) >= 36
+        vector = isinstance(part, gym.spaces.Box) and len(part.shape) == 1
+        if not pixels and not vector:
+            raise ValueError(
+                f"the observation space {name}: {part} is not supported; use pixels (height, width, channels) "
+                "of at least 36 x 36, a vector, or a Dict of these"
+            )
+    return parts
+
+
+def action_branches(space: gym.Space) -> list[int]:
+    """Return the number of actions of each branch; raise ValueError for other than Discrete and MultiDiscrete."""
+    if isinstance(space, gym.spaces.Discrete):
+        return [int(space.n)]
+    if isinstance(space, gym.spaces.MultiDiscrete) and space.nvec.ndim == 1:
+        return space.nvec.tolist()
+    raise ValueError(f"the action space {space} is not supported; use Discrete or one-dimensional MultiDiscrete")
+
+
+def to_env_actions(actions: Tensor, space: gym.Space) -> np.ndarray:
+    """Turn branch choices (N, A) into what the environments take: (N,) for Discrete, (N, A) for MultiDiscrete."""
+    actions = actions.cpu().numpy() + space.start  # the first action's number, 0 unless the space says otherwise
+    return actions[:, 0] if isinstance(space, gym.spaces.Discrete) else actions
+
+
+def as_tensors(obs: np.ndarray | dict[str, np.ndarray]) -> dict[str, Tensor]:
+    """Give observations their names of `observation_spaces`, as tensors on the CPU."""
+    parts = obs if isinstance(obs, dict) else {"observation": obs}
+    return {name: torch.from_numpy(np.ascontiguousarray(part)) for name, part in parts.items()}
+
+
+def require(module: str, name: str, extra: str):
+    """Import a module that only the flag `name` needs; raise ImportError that says which extra brings it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise ImportError(f'{name} needs {module.split(".")[0]}: pip install -e ".[{extra}]"') from None
+
+
+class LaneRecorder:
+    """Writes videos of lane 0, of the episodes that Gymnasium's capped cubic schedule picks (0, 1, 8, 27, ...).
+
+    A video shows every observation that was acted on, up to max_frames. Raises ImportError without the extra `play`,
+    ValueError if the environment draws no pictures.
+    """
+
+    def __init__(self, envs: gym.vector.VectorEnv, folder: str, max_frames: int = 1000):
+        self.envs, self.folder, self.max_frames = envs, folder, max_frames
+        self.episode, self.frames = 0, []
+        self.write = require("moviepy.video.io.ImageSequenceClip", "--capture-video", "play").ImageSequenceClip
+        # Gymnasium's module imports moviepy as well, so it must not be imported without the extra.
+        self.is_due = importlib.import_module("gymnasium.utils.save_video").capped_cubic_video_schedule
+        if not isinstance((envs.render() or [None])[0], np.ndarray):
+            raise ValueError("--capture-video needs an environment that draws pictures (render_mode rgb_array)")
+
+    def capture(self) -> None:
+        """Keep a frame of the episode that is being played, if it is one to record."""
+        if self.is_due(self.episode) and len(self.frames) < self.max_frames:
+            self.frames.append(self.envs.render()[0])
+
+    def end_episode(self) -> None:
+        """Write the episode's frames to episode-<number>.mp4 and go on to the next episode."""
+        if self.frames:
+            os.makedirs(self.folder, exist_ok=True)
+            clip = self.write(self.frames, fps=self.envs.metadata.get("render_fps", 30))
+            clip.write_videofile(os.path.join(self.folder, f"episode-{self.episode}.mp4"), logger=None)
+        self.episode, self.frames = self.episode + 1, []
+
+
+# ---- 3 PURE FUNCTIONS ----
+def layer_init(layer: nn.Module, gain: float = math.sqrt(2)) -> nn.Module:
+    """Initialize a layer's weights orthogonally and its biases with zero; return it."""
+    for name, parameter in layer.named_parameters():
+        nn.init.zeros_(parameter) if "bias" in name else nn.init.orthogonal_(parameter, gain)
+    return layer
+
+
+def anneal(step: int, initial: float, final: float, anneal_steps: int) -> float:
+    """Decay linearly from initial to final over anneal_steps, then stay; without anneal_steps stay at initial."""
+    fraction = min(step / anneal_steps, 1.0) if anneal_steps else 0.0
+    return initial + fraction * (final - initial)
+
+
+def gae(
+    rewards: Tensor,
+    values: Tensor,
+    last_value: Tensor,
+    terminated: Tensor,
+    truncated: Tensor,
+    truncation_values: Tensor,
+    gamma: float,
+    gae_lambda: float,
+) -> Tensor:
+    """Return the advantages (T, N) of generalized advantage estimation (2.34), cut wherever an episode ends.
+
+    last_value (N,) is the value of the observation after the last step. truncation_values (T, N) holds the value of
+    the final observation where a truncated episode is bootstrapped and zero elsewhere; a terminated one never is.
+    """
+    done = terminated | truncated
+    next_values = torch.cat([values[1:], last_value[None]])  # (T, N)
+    next_values = torch.where(done, truncation_values * ~terminated, next_values)
+    deltas = rewards + gamma * next_values - values
+    carry = gamma * gae_lambda * ~done
+    advantages = torch.empty_like(deltas)
+    advantage = torch.zeros_like(last_value)
+    for t in reversed(range(len(deltas))):
+        advantages[t] = advantage = deltas[t] + carry[t] * advantage
+    return advantages
+
+
+def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tensor:
+    """Return the clipped surrogate loss (2.41) of log_ratio (R, A), averaged over branches (5.4) and steps."""
+    ratio, advantages = log_ratio.exp(), advantages[:, None]
+    clipped = ratio.clamp(1 - clip_coef, 1 + clip_coef)
+    return -torch.minimum(ratio * advantages, clipped * advantages).mean()
+
+
+def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: float | None) -> Tensor:
+    """Return the mean squared error of values (R,), clipped around old_values (2.43) unless clip_coef is None."""
+    loss = (values - returns).square()
+    if clip_coef is not None:
+        clipped = old_values + (values - old_values).clamp(-clip_coef, clip_coef)
+        loss = torch.maximum(loss, (clipped - returns).square())
+    return loss.mean()
+
+
+@dataclass
+class Pieces:
+    """Runs of consecutive steps of one lane each. Step t of lane n has the flat index t * N + n."""
+
+    first: Tensor  # (S,) flat index of each piece's first step
+    length: Tensor  # (S,) steps of each piece
+    lanes: int  # N
+
+    @classmethod
+    def cut(cls, begins: Tensor) -> "Pieces":
+        """Cut the rollout of all lanes before every step where begins (T, N) is true; the first step always is."""
+        steps, lanes = begins.shape
+        cuts = begins.T.flatten().nonzero()[:, 0]  # lane after lane, so that a piece's steps are neighbours
+        length = torch.diff(cuts, append=torch.tensor([steps * lanes]))
+        return cls(cuts % steps * lanes + cuts // steps, length, lanes)
+
+    def steps(self) -> Tensor:
+        """Return the flat indices (R,) of all steps, piece after piece."""
+        start = self.length.cumsum(0) - self.length
+        within = torch.arange(int(self.length.sum())) - start.repeat_interleave(self.length)
+        return self.first.repeat_interleave(self.length) + within * self.lanes
+
+    def minibatches(self, count: int) -> Iterator["Pieces"]:
+        """Shuffle the pieces and deal them, whole, into count minibatches of nearly the same number of steps."""
+        order = torch.randperm(len(self.first))
+        first, length = self.first[order], self.length[order]
+        share = (length.cumsum(0) - length) * count // length.sum()  # (S,) the minibatch that a piece goes to
+        for i in range(count):
+            yield Pieces(first[share == i], length[share == i], self.lanes)
+
+
+# ---- 4 ENCODERS AND HEADS ----
+class AtariCNN(nn.Sequential):
+    """The convolutions of Mnih et al. (2015), table 6.2: pixels (B, height, width, channels) to features (B, F)."""
+
+    def __init__(self, channels: int, chunk: int = 256):
+        super().__init__(
+            layer_init(nn.Conv2d(channels, 32, 8, 4)),
+            nn.ReLU(inplace=True),
+            layer_init(nn.Conv2d(32, 64, 4, 2)),
+            nn.ReLU(inplace=True),
+            layer_init(nn.Conv2d(64, 64, 3, 1)),
+            nn.ReLU(inplace=True),
+        )
+        self.chunk = chunk
+        self.to(memory_format=torch.channels_last)  # the order in which the environments deliver pixels
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Encode uint8 pixels, scaled to [0, 1], or float ones as they are."""
+        # A CPU's caches want small batches: the backward pass of 2,048 frames at once takes about 1.5 times as long.
+        chunks = pixels.split(self.chunk) if pixels.device.type == "cpu" else [pixels]
+        features = [super(AtariCNN, self).forward(self.scale(chunk)) for chunk in chunks]
+        features = torch.cat(features) if len(features) > 1 else features[0]  # (B, channels, height, width)
+        return features.permute(0, 2, 3, 1).flatten(1)  # in the order they have in memory: no copy
+
+    @staticmethod
+    def scale(pixels: Tensor) -> Tensor:
+        """Turn (B, height, width, channels) into float (B, channels, height, width), still channels last in memory."""
+        scaled = pixels.float().mul_(1 / 255) if pixels.dtype == torch.uint8 else pixels
+        return scaled.permute(0, 3, 1, 2)
+
+
+class Encoder(nn.Module):
+    """Encodes each part of an observation, concatenates the features and embeds them in the memory's width (5.1)."""
+
+    def __init__(self, spaces: dict[str, gym.spaces.Box], width: int):
+        super().__init__()
+        self.pixels = [name for name, space in spaces.items() if len(space.shape) == 3]
+        self.vectors = [name for name, space in spaces.items() if len(space.shape) == 1]
+        self.cnns = nn.ModuleList(AtariCNN(spaces[name].shape[2]) for name in self.pixels)
+        with torch.no_grad():
+            blank = [torch.zeros(1, *spaces[name].shape) for name in self.pixels]
+            features = sum(cnn(x).shape[1] for cnn, x in zip(self.cnns, blank, strict=True))
+        if self.vectors:
+            self.mlp = layer_init(nn.Linear(sum(spaces[name].shape[0] for name in self.vectors), 128))
+            features += 128
+        self.embedding = layer_init(nn.Linear(features, width))
+
+    def forward(self, obs: dict[str, Tensor]) -> Tensor:
+        """Encode observations of B steps, each part (B, ...), to (B, D)."""
+        features = [cnn(obs[name]) for cnn, name in zip(self.cnns, self.pixels, strict=True)]
+        if self.vectors:
+            features.append(F.relu(self.mlp(torch.cat([obs[name].float() for name in self.vectors], -1))))
+        features = torch.cat(features, -1) if len(features) > 1 else features[0]
+        return F.relu(self.embedding(features))
+
+
+class Heads(nn.Module):
+    """The layer after the memory, the multi-discrete policy and the state value (table 6.2)."""
+
+    def __init__(self, width: int, branches: list[int]):
+        super().__init__()
+        self.branches = branches
+        self.trunk = layer_init(nn.Linear(width, 512))
+        self.policy = nn.Sequential(
+            layer_init(nn.Linear(512, 512)), nn.ReLU(inplace=True), layer_init(nn.Linear(512, sum(branches)), 0.1)
+        )
+        self.value = nn.Sequential(
+            layer_init(nn.Linear(512, 512)), nn.ReLU(inplace=True), layer_init(nn.Linear(512, 1), 1.0)
+        )
+
+    def forward(self, x: Tensor) -> tuple[list[Categorical], Tensor]:
+        """Map what the memory says, (B, D), to a distribution of each action branch and to values (B,)."""
+        x = F.relu(self.trunk(x))
+        logits = self.policy(x).split(self.branches, -1)
+        return [Categorical(logits=part, validate_args=False) for part in logits], self.value(x)[:, 0]
+
+
+# ---- 5 MEMORY ----
+def visible(age: Tensor, step: Tensor, window: int) -> Tensor:
+    """Tell whether a query at this step of its episode sees the item that was made `age` steps before it.
+
+    Nothing else decides what is seen: not the rollout, not the value that bootstraps, not the update.
+    """
+    return (age >= 1) & (age <= step) & (age <= window)
+
+
+def sinusoid(position: Tensor, width: int) -> Tensor:
+    """Encode positions, steps or ages of any shape, as sines and cosines (2.57, 2.58): (..., width) float64."""
+    frequency = 10000 ** (-torch.arange(0, width, 2, dtype=torch.float64, device=position.device) / width)
+    angle = position[..., None] * frequency
+    return torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)  # (..., width / 2, 2) to (..., width)
+
+
+class Attention(nn.Module):
+    """Multi-head attention (2.55, 2.56) to items whose keys and values are made apart, once an item."""
+
+    def __init__(self, width: int, heads: int, relative: bool):
+        super().__init__()
+        self.heads = heads
+        self.query = nn.Linear(width, width, bias=False)
+        self.key = nn.Linear(width, width, bias=False)
+        self.value = nn.Linear(width, width, bias=False)
+        self.output = nn.Linear(width, width)
+        if relative:
+            self.content_bias = nn.Parameter(torch.zeros(width))  # u of (2.61)
+            self.position_bias = nn.Parameter(torch.zeros(width))  # v
+        self.relative = relative
+
+    def forward(self, x: Tensor, keys: Tensor, values: Tensor, age: Tensor, seen: Tensor) -> Tensor:
+        """Attend from x (S, L, D) to keys and values (S, M, D): exactly zero where nothing is seen.
+
+        age (L, M) is how many steps lie between a query and an item; seen (S, L, M) which items a query sees.
+        """
+        query, mask, blind = self.query_and_mask(x, age, seen)
+        heads = F.scaled_dot_product_attention(query, self.split(keys), self.split(values), mask)  # (S, H, L, D / H)
+        return self.output(heads.transpose(1, 2).flatten(2)).masked_fill(blind, 0.0)
+
+    def weights(self, x: Tensor, keys: Tensor, age: Tensor, seen: Tensor) -> Tensor:
+        """Return how much of each item `forward` takes, (S, H, L, M)."""
+        query, mask, blind = self.query_and_mask(x, age, seen)
+        bias = torch.zeros_like(mask, dtype=x.dtype).masked_fill(~mask, -math.inf) if mask.dtype == torch.bool else mask
+        scores = query @ self.split(keys).transpose(2, 3) / math.sqrt(query.shape[-1])
+        return (scores + bias).softmax(-1).masked_fill(blind[:, None], 0.0)
+
+    def query_and_mask(self, x: Tensor, age: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return queries (S, H, L, D / H), the mask or what to add to the scores, and who sees nothing (S, L, 1)."""
+        blind = ~seen.any(-1, keepdim=True)
+        mask = (seen | blind)[:, None]  # (S, 1, L, M); a row without any item would make the softmax NaN
+        if not self.relative:
+            return self.split(self.query(x)), mask, blind
+        query = self.split(self.query(x + self.content_bias))
+        ages = torch.arange(1, int(age.max()) + 1, device=x.device)  # (A,)
+        encoded = self.split(self.key(sinusoid(ages, x.shape[-1]).to(x.dtype))[None])  # (1, H, A, D / H)
+        by_age = self.split(self.query(x + self.position_bias)) @ encoded.transpose(2, 3)  # (S, H, L, A)
+        at = (age.clamp(min=1) - 1).expand(*by_age.shape[:3], -1)  # (S, H, L, M)
+        bias = by_age.gather(-1, at) / math.sqrt(query.shape[-1])
+        return query, bias.masked_fill(~mask, -math.inf), blind
+
+    def split(self, x: Tensor) -> Tensor:
+        """Deal the width out to the heads: (S, L, D) to (S, H, L, D / H)."""
+        return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+
+
+class Gate(nn.Module):
+    """The gated recurrent unit that takes the place of a residual connection in GTrXL (2.4.7; Parisotto et al., 2020).
+
+    The stream x is its hidden state and what a layer made of it, y, its input. A bias above 0 holds on to x at first.
+    """
+
+    def __init__(self, width: int, bias: float):
+        super().__init__()
+        self.from_y = nn.Linear(width, 3 * width, bias=False)
+        self.from_x = nn.Linear(width, 2 * width, bias=False)
+        self.candidate = nn.Linear(width, width, bias=False)
+        self.bias = nn.Parameter(torch.full((width,), bias))
+
+    def forward(self, x: Tensor, y: Tensor) -> Tensor:
+        """Merge x and y, (S, L, D) each."""
+        (reset_y, update_y, new_y), (reset_x, update_x) = self.from_y(y).chunk(3, -1), self.from_x(x).chunk(2, -1)
+        reset, update = torch.sigmoid(reset_y + reset_x), torch.sigmoid(update_y + update_x - self.bias)
+        return torch.lerp(x, torch.tanh(new_y + self.candidate(reset * x)), update)
+
+
+class Block(nn.Module):
+    """A transformer block with the layer norms first (figure 5.5): attention to the memory, then a projection."""
+
+    def __init__(self, args: Args):
+        super().__init__()
+        width = args.trxl_dim
+        self.norm_query, self.norm_items, self.norm_output = (nn.LayerNorm(width) for _ in range(3))
+        self.attention = Attention(width, args.trxl_num_heads, args.trxl_positional_encoding == "relative")
+        self.projection = nn.Linear(width, width)
+        if args.trxl_gate == "gru":
+            self.merge_attention, self.merge_output = (Gate(width, args.trxl_gate_bias) for _ in range(2))
+        else:
+            self.merge_attention = self.merge_output = torch.add  # residual connections
+
+    def keys_values(self, items: Tensor) -> tuple[Tensor, Tensor]:
+        """Make the keys and values of items (..., D), which carry their positions already."""
+        items = self.norm_items(items)
+        return self.attention.key(items), self.attention.value(items)
+
+    def forward(self, x: Tensor, position: Tensor | float, keys_values: tuple, age: Tensor, seen: Tensor) -> Tensor:
+        """Map x (S, L, D), which queries from `position` (S, L, D), to the next block's input (S, L, D)."""
+        x = self.merge_attention(x, self.attention(self.norm_query(x + position), *keys_values, age, seen))
+        return self.merge_output(x, F.relu(self.projection(self.norm_output(x))))
+
+
+@dataclass
+class Live:
+    """The live memory of N lanes, a cache. Its rows are those of the rollout's timeline, and one more."""
+
+    now: int  # the row of the step to come
+    steps: Tensor  # (N,) which step of its episode that is
+    keys: Tensor  # (K, N, W + T + 1, D) made of each block's past inputs
+    values: Tensor  # (K, N, W + T + 1, D)
+
+
+@dataclass
+class Timeline:
+    """What a rollout stores: row W + t is its step t, and the W rows before are the steps before it."""
+
+    items: Tensor  # (W + T, N, K, D) the input of every block, detached
+    steps: Tensor  # (W + T, N) which step of its episode that was
+
+
+class Memory(nn.Module):
+    """Transformer-XL as an episodic memory with a sliding window (thesis 5.3), or GTrXL.
+
+    Every step leaves behind an item, the inputs of the K blocks. A step's query in block k sees the k-th part of the
+    items of up to W steps before it, of the same episode, never its own.
+    """
+
+    # Those that shape the network.
+    flags = ("trxl_num_layers", "trxl_num_heads", "trxl_dim", "trxl_positional_encoding", "trxl_pe_length", "trxl_gate")
+
+    def __init__(self, args: Args):
+        super().__init__()
+        self.width, self.window, self.num_steps = args.trxl_dim, args.trxl_memory_length, args.num_steps
+        self.segment_length, self.query_position = args.trxl_segment_length, args.trxl_query_position
+        self.encoding = args.trxl_positional_encoding
+        self.blocks = nn.ModuleList(Block(args) for _ in range(args.trxl_num_layers))
+        for block in self.blocks:
+            block_init(block, args.trxl_init, args.trxl_num_layers)
+        if self.encoding == "learned":
+            self.table = nn.Parameter(torch.randn(args.trxl_pe_length, self.width) / math.sqrt(self.width))
+
+    def initial(self, lanes: int, device: torch.device) -> Live:
+        """Return the live memory of fresh episodes."""
+        cache = (len(self.blocks), lanes, self.window + self.num_steps + 1, self.width)
+        steps = torch.zeros(lanes, dtype=torch.int64, device=device)
+        return Live(self.window, steps, torch.zeros(cache, device=device), torch.zeros(cache, device=device))
+
+    def storage(self, num_steps: int, lanes: int, device: torch.device) -> Timeline:
+        """Return room for what a rollout stores."""
+        shape = (self.window + num_steps, lanes)
+        items = torch.zeros(*shape, len(self.blocks), self.width, device=device)
+        return Timeline(items, torch.zeros(shape, dtype=torch.int64, device=device))
+
+    def store(self, stored: Timeline, t: int, item: tuple[Tensor, Tensor]) -> None:
+        """Put away what step t of the rollout has to be remembered for."""
+        stored.items[self.window + t], stored.steps[self.window + t] = item
+
+    def refresh(self, live: Live, stored: Timeline) -> Live:
+        """Begin a new rollout: its timeline with the last W steps, its cache with their keys and values made anew.
+
+        Those in the cache were made by the weights before the update.
+        """
+        for rows in (stored.items, stored.steps):
+            rows[: self.window] = rows[self.num_steps :].clone()  # overlaps itself if the window is the longer
+        live = Live(self.window, live.steps, live.keys, live.values)
+        rows, _, seen = self.look_back(live)
+        seen = seen[:, 0].T  # (M, N)
+        items = stored.items[rows].masked_fill(~seen[..., None, None], 0.0)  # (M, N, K, D)
+        position = self.position(stored.steps[rows].where(seen, 0), items.dtype)  # (M, N, D)
+        for k, block in enumerate(self.blocks):
+            keys, values = block.keys_values(items[:, :, k] + position)
+            live.keys[k][:, rows], live.values[k][:, rows] = keys.transpose(0, 1), values.transpose(0, 1)
+        return live
+
+    def step(self, x: Tensor, live: Live) -> tuple[Tensor, Live, tuple[Tensor, Tensor]]:
+        """Take one step of all lanes: x (N, D) to (N, D), the new live memory, and what to store of this step.
+
+        Writes the cache's row of this step, which no query of this step sees: to take the step again changes nothing.
+        Raises ValueError if an episode outlasts a learned encoding's table.
+        """
+        self.check_length(live.steps)
+        rows, age, seen = self.look_back(live)
+        position = self.position(live.steps, x.dtype)  # (N, D)
+        inputs = []
+        x = x[:, None]  # (N, 1, D)
+        for k, block in enumerate(self.blocks):
+            inputs.append(x[:, 0])
+            memory = live.keys[k][:, rows], live.values[k][:, rows]  # (N, M, D) each
+            live.keys[k][:, live.now], live.values[k][:, live.now] = block.keys_values(x[:, 0] + position)
+            x = block(x, self.query_encoding(live.steps[:, None], x.dtype) if k == 0 else 0.0, memory, age, seen)
+        new_live = Live(live.now + 1, live.steps + 1, live.keys, live.values)
+        return x[:, 0], new_live, (torch.stack(inputs, 1), live.steps)
+
+    def attention(self, x: Tensor, live: Live) -> Tensor:
+        """Return what the step of x (N, D) looks at: weights (N, K, H, M) of the last M steps, the oldest first."""
+        rows, age, seen = self.look_back(live)
+        x, found = x[:, None], []  # (N, 1, D)
+        for k, block in enumerate(self.blocks):
+            position = self.query_encoding(live.steps[:, None], x.dtype) if k == 0 else 0.0
+            memory = live.keys[k][:, rows], live.values[k][:, rows]
+            found.append(block.attention.weights(block.norm_query(x + position), memory[0], age, seen)[:, :, 0])
+            x = block(x, position, memory, age, seen)
+        return torch.stack(found, 1)
+
+    def look_back(self, live: Live) -> tuple[slice, Tensor, Tensor]:
+        """Return the cache's rows that a step may see, their ages (1, M), and which of them it sees (N, 1, M)."""
+        longest = min(max(int(live.steps.max()), 1), self.window)  # no further back than the oldest episode
+        rows = slice(live.now - longest, live.now)
+        age = torch.arange(longest, 0, -1, device=live.steps.device)[None]  # (1, M)
+        return rows, age, visible(age, live.steps[:, None], self.window)[:, None]
+
+    def reset(self, live: Live, done: Tensor) -> Live:
+        """Forget the lanes whose episode ended, where done (N,) is true."""
+        rows, _, _ = self.look_back(live)
+        for cache in (live.keys, live.values):
+            # Nothing sees these any more. As zeros, not even a NaN among them could pass through a weight of zero.
+            cache[:, done.nonzero()[:, 0], rows] = 0.0
+        return Live(live.now, live.steps.masked_fill(done, 0), live.keys, live.values)
+
+    def cut(self, done: Tensor) -> Pieces:
+        """Cut a rollout, whose episodes end where done (T, N) is true, into segments: an episode's end needs no cut."""
+        begins = torch.arange(len(done)) % self.segment_length == 0
+        return Pieces.cut(begins[:, None].expand_as(done))
+
+    def unroll(self, x: Tensor, pieces: Pieces, stored: Timeline) -> Tensor:
+        """Run whole segments at once: x (R, D) to (R, D), with the items of the W steps before each segment."""
+        first, length = pieces.first.to(x.device), pieces.length.to(x.device)
+        row, lane = self.window + first[:, None] // pieces.lanes, first[:, None] % pieces.lanes  # (S, 1) each
+        x = pad_sequence(x.split(pieces.length.tolist()), batch_first=True)  # (S, L, D)
+        at = torch.arange(x.shape[1], device=x.device)  # (L,)
+        real = at < length[:, None]  # (S, L)
+        steps = stored.steps[(row + at).clamp(max=len(stored.steps) - 1), lane].where(real, 0)
+        back = min(max(int(steps.max()), 1), self.window)  # no further than the longest episode
+        rows = row + torch.arange(-back, x.shape[1] - 1, device=x.device)  # (S, M); a segment's last item is not seen
+        rows = rows.clamp(max=len(stored.steps) - 1)
+        age = at[:, None] + torch.arange(back, 1 - x.shape[1], -1, device=x.device)  # (L, M)
+        seen = visible(age, steps[..., None], self.window)  # (S, L, M)
+
+        used = seen.any(1)  # (S, M)
+        items = stored.items[rows, lane].masked_fill(~used[..., None, None], 0.0)  # (S, M, K, D)
+        position = self.position(stored.steps[rows, lane].where(used, 0), x.dtype)  # (S, M, D)
+        for k, block in enumerate(self.blocks):
+            encoding = self.query_encoding(steps, x.dtype) if k == 0 else 0.0
+            x = block(x, encoding, block.keys_values(items[:, :, k] + position), age, seen)
+        return x[real]
+
+    def position(self, steps: Tensor, dtype: torch.dtype) -> Tensor | float:
+        """Return the encoding (..., D) of items that were made at these steps of their episodes."""
+        if self.encoding == "learned":
+            return self.table[steps]
+        return sinusoid(steps, self.width).to(dtype) if self.encoding == "absolute" else 0.0
+
+    def query_encoding(self, steps: Tensor, dtype: torch.dtype) -> Tensor | float:
+        """Return what tells the first block's query (S, L, D) its own step (7.1.3), if it is to be told."""
+        if not self.query_position:
+            return 0.0
+        return self.table[steps] if self.encoding == "learned" else sinusoid(steps, self.width).to(dtype)
+
+    def check_length(self, steps: Tensor) -> None:
+        """Raise ValueError if a lane's episode outlasts the learned encoding's table."""
+        if self.encoding == "learned" and int(steps.max()) >= len(self.table):
+            raise ValueError(
+                f"--trxl-pe-length is {len(self.table)}, but an episode is longer; make it the longest episode's "
+                "length, or use --trxl-positional-encoding absolute or relative, which have no such limit"
+            )
+
+    def numbers(self, pieces: Pieces, stored: Timeline) -> dict[str, float]:
+        """Return what to log of a minibatch: the share of padding, and the longest window that any of its steps saw."""
+        padding = 1 - float(pieces.length.float().mean() / pieces.length.max())
+        longest = stored.steps.flatten()[pieces.steps().to(stored.steps.device) + self.window * pieces.lanes].max()
+        return {"padding_fraction": padding, "memory_window": min(int(longest), self.window)}
+
+
+def block_init(block: Block, scheme: str, blocks: int) -> None:
+    """Initialize the weights of a block's layers by the scheme (table 6.1), and their biases with zero.
+
+    T-Fixup (Huang et al., 2020) is Xavier with all but queries and keys scaled down to the depth.
+    """
+    init = {"orthogonal": nn.init.orthogonal_, "kaiming": nn.init.kaiming_normal_}.get(scheme, nn.init.xavier_uniform_)
+    for layer in block.modules():
+        if isinstance(layer, nn.Linear):
+            init(layer.weight)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+    if scheme == "tfixup":
+        with torch.no_grad():
+            for layer in (block.attention.value, block.attention.output, block.projection):
+                layer.weight.mul_(0.67 * blocks**-0.25)
+
+
+# ---- 6 AGENT ----
+class Agent(nn.Module):
+    """Encoder, memory and heads. Plays step by step with `act`, learns from whole pieces with `evaluate`.
+
+    Raises ValueError for spaces that it cannot encode or act in.
+    """
+
+    def __init__(self, observation_space: gym.Space, action_space: gym.Space, args: Args):
+        super().__init__()
+        self.memory = Memory(args)
+        self.encoder = Encoder(observation_spaces(observation_space), self.memory.width)
+        self.heads = Heads(self.memory.width, action_branches(action_space))
+
+    def act(self, obs: dict[str, Tensor], live: Any) -> tuple[list[Categorical], Tensor, Any, Any]:
+        """Take one step of all lanes: the action distributions, values (N,), new live memory, and what to store."""
+        x, live, stored = self.memory.step(self.encoder(obs), live)
+        return *self.heads(x), live, stored
+
+    def evaluate(self, obs: dict[str, Tensor], pieces: Pieces, stored: Any) -> tuple[list[Categorical], Tensor]:
+        """Recompute the action distributions and values (R,) of the steps of the pieces, in the pieces' order."""
+        return self.heads(self.memory.unroll(self.encoder(obs), pieces, stored))
+
+
+def save_model(agent: Agent, args: Args, path: str) -> None:
+    """Write weights and arguments to path, whole or not at all."""
+    torch.save({"args": asdict(args), "weights": agent.state_dict()}, path + ".part")
+    os.replace(path + ".part", path)
+
+
+def load_model(path: str) -> tuple[Args, dict[str, Tensor]]:
+    """Read the arguments and the weights, on the CPU, of a file that `save_model` wrote.
+
+    Raises ValueError if the file is not such a file, OSError if it cannot be read.
+    """
+    if not os.path.isfile(path):
+        raise OSError(f"there is no file {path}; --save-model writes model.pt to the run folder")
+    with open(path, "rb") as file:
+        try:
+            saved = torch.load(file, map_location="cpu", weights_only=True)
+            known = {field.name for field in fields(Args)}
+            return Args(**{k: v for k, v in saved["args"].items() if k in known}), saved["weights"]
+        except Exception:  # what torch.load raises for a file of another kind is many things, and none tells more
+            raise ValueError(f"{path} is not a model that --save-model wrote") from None
+
+
+def load_weights(agent: Agent, path: str) -> None:
+    """Give the agent the weights in the file.
+
+    Raises ValueError if they belong to another network or the file holds none, OSError if it cannot be read.
+    """
+    saved_args, weights = load_model(path)
+    try:
+        agent.load_state_dict(weights)
+    except (RuntimeError, TypeError):
+        flags = [f"{flag(name)} {getattr(saved_args, name)}" for name in ("env_id", *agent.memory.flags)]
+        raise ValueError(f"{path} holds the weights of another network, trained with {' '.join(flags)}") from None
+
+
+# ---- 7 TRAINING ----
+@dataclass
+class Rollout:
+    """What T steps of N lanes leave behind to learn from, on the device; overwritten by every iteration."""
+
+    obs: dict[str, Tensor]  # each (T, N, ...): uint8 pixels stay uint8
+    actions: Tensor  # (T, N, A)
+    log_probs: Tensor  # (T, N, A)
+    values: Tensor  # (T, N)
+    rewards: Tensor  # (T, N)
+    terminated: Tensor  # (T, N) the step ended its episode
+    truncated: Tensor  # (T, N) the step ended its episode by a time limit
+    truncation_values: Tensor  # (T, N) value of the final observation, where bootstrapped
+    memory: Any  # what the memory stores of the steps
+
+
+def make_rollout(agent: Agent, obs: dict[str, Tensor], num_steps: int, device: torch.device) -> Rollout:
+    """Allocate a rollout for observations like obs, (N, ...) each."""
+    lanes = len(next(iter(obs.values())))
+
+    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.zeros(num_steps, lanes, *shape, dtype=dtype, device=device)
+
+    branches = len(agent.heads.branches)
+    return Rollout(
+        obs={name: empty(*part.shape[1:], dtype=part.dtype) for name, part in on_device(obs, device).items()},
+        actions=empty(branches, dtype=torch.int64),
+        log_probs=empty(branches),
+        values=empty(),
+        rewards=empty(),
+        terminated=empty(dtype=torch.bool),
+        truncated=empty(dtype=torch.bool),
+        truncation_values=empty(),
+        memory=agent.memory.storage(num_steps, lanes, device),
+    )
+
+
+@dataclass
+class Play:
+    """Where the lanes are between two rollouts."""
+
+    obs: dict[str, Tensor]  # (N, ...) the observations to act on next
+    live: Any  # the live memory
+    returns: np.ndarray  # (N,) undiscounted return of each lane's episode so far
+    lengths: np.ndarray  # (N,) steps of each lane's episode so far
+
+
+@torch.no_grad()
+def collect(
+    agent: Agent, envs: gym.vector.VectorEnv, play: Play, rollout: Rollout, args: Args, recorder: LaneRecorder | None
+) -> tuple[Tensor, dict[str, list[float]]]:
+    """Play T steps of all lanes into the rollout; return the value (N,) of what follows, and the ended episodes.
+
+    The episodes are lists of numbers by name: charts/episodic_return, charts/episodic_length, and episode/* for every
+    number in the environment's final info. Leaves `play` where the next rollout goes on.
+    """
+    device, episodes = rollout.values.device, defaultdict(list)
+    rollout.truncation_values.zero_()
+    play.live = agent.memory.refresh(play.live, rollout.memory)
+    for t in range(args.num_steps):
+        for name, part in play.obs.items():
+            rollout.obs[name][t] = part  # the first and only copy: env to device, dtype kept
+        obs = {name: part[t] for name, part in rollout.obs.items()}
+        policy, rollout.values[t], live, stored = agent.act(obs, play.live)
+        agent.memory.store(rollout.memory, t, stored)
+        actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
+        rollout.actions[t], rollout.log_probs[t] = actions, log_probs_of(policy, actions)
+        if recorder is not None:
+            recorder.capture()
+
+        obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
+        play.obs = as_tensors(obs)
+        rollout.rewards[t] = torch.as_tensor(rewards)
+        rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
+        if args.bootstrap_truncated and truncated.any():
+            final = on_device(final_observations(play.obs, infos, truncated), device)
+            value = agent.act(final, live)[1]  # from the memory as it was before the reset
+            rollout.truncation_values[t] = value * rollout.truncated[t]
+
+        done = terminated | truncated
+        play.live = agent.memory.reset(live, torch.as_tensor(done, device=device))
+        note_episodes(play, rewards, done, infos, episodes)
+        if recorder is not None and done[0]:
+            recorder.end_episode()
+    _, last_value, _, _ = agent.act(on_device(play.obs, device), play.live)
+    return last_value, episodes
+
+
+def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
+    """Return the log-probability (B, A) of the chosen action (B, A) of every branch."""
+    return torch.stack([branch.log_prob(action) for branch, action in zip(policy, actions.unbind(-1), strict=True)], -1)
+
+
+def on_device(obs: dict[str, Tensor], device: torch.device) -> dict[str, Tensor]:
+    """Move observations to the device, as the encoder takes them."""
+    return {k: v.to(device, v.dtype if v.dtype == torch.uint8 else torch.float32) for k, v in obs.items()}
+
+
+def final_observations(obs: dict[str, Tensor], infos: dict, lanes: np.ndarray) -> dict[str, Tensor]:
+    """Return observations (N, ...) in which the given lanes hold the last one of the episode that just ended."""
+    obs = {name: part.clone() for name, part in obs.items()}
+    for lane in lanes.nonzero()[0]:
+        for name, part in as_tensors(infos["final_obs"][lane]).items():
+            obs[name][lane] = part
+    return obs
+
+
+def note_episodes(play: Play, rewards: np.ndarray, done: np.ndarray, infos: dict, episodes: dict[str, list]) -> None:
+    """Count the step in every lane's return and length; move those of ended episodes to the lists in episodes."""
+    play.returns += rewards
+    play.lengths += 1
+    if not done.any():
+        return
+    episodes["charts/episodic_return"] += play.returns[done].tolist()
+    episodes["charts/episodic_length"] += play.lengths[done].tolist()
+    play.returns[done], play.lengths[done] = 0, 0
+    final = infos.get("final_info", {})
+    for name, values in final.items():
+        if f"_{name}" in final and isinstance(values, np.ndarray):
+            ended = np.array(values[done & final[f"_{name}"]].tolist())
+            if ended.ndim == 1 and ended.dtype.kind in "biuf":
+                episodes[f"episode/{name}"] += ended.tolist()
+
+
+def minibatch_loss(
+    agent: Agent, rollout: Rollout, targets: tuple[Tensor, Tensor], pieces: Pieces, ent_coef: float, args: Args
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the total loss (5.7) of the pieces' steps and the numbers to log; targets: advantages, returns (T, N)."""
+    steps = pieces.steps().to(rollout.values.device)  # (R,)
+
+    def take(stored: Tensor) -> Tensor:
+        return stored.flatten(0, 1).index_select(0, steps)
+
+    policy, values = agent.evaluate({k: take(v) for k, v in rollout.obs.items()}, pieces, rollout.memory)
+    log_ratio = log_probs_of(policy, take(rollout.actions)) - take(rollout.log_probs)  # (R, A)
+    entropy = torch.stack([branch.entropy() for branch in policy], -1).sum(-1).mean()
+    advantages, returns = map(take, targets)
+    if args.norm_adv:
+        advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+    pg_loss = policy_loss(log_ratio, advantages, args.clip_coef)
+    v_loss = value_loss(values, take(rollout.values), returns, args.clip_coef if args.clip_vloss else None)
+    loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
+    with torch.no_grad():
+        off, joint = log_ratio.exp() - 1, log_ratio.sum(-1)  # the branches are independent: log-ratios add up
+        logs = {
+            "losses/policy_loss": pg_loss,
+            "losses/value_loss": v_loss,
+            "losses/entropy": entropy,
+            "losses/loss": loss,
+            "losses/old_approx_kl": -joint.mean(),
+            "losses/approx_kl": (joint.exp() - 1 - joint).mean(),  # http://joschu.net/blog/kl-approx.html
+            "losses/clipfrac": (off.abs() > args.clip_coef).float().mean(),
+            "losses/ratio_error": off.abs().max(),
+        }
+    return loss, {name: value.detach() for name, value in logs.items()}
+
+
+def update(
+    agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, last_value: Tensor, ent_coef: float, args: Args
+) -> dict[str, float]:
+    """Learn from the rollout for some epochs; return what to log, averaged over the minibatches."""
+    advantages = gae(
+        rewards=rollout.rewards,
+        values=rollout.values,
+        last_value=last_value,
+        terminated=rollout.terminated,
+        truncated=rollout.truncated,
+        truncation_values=rollout.truncation_values,
+        gamma=args.gamma,
+        gae_lambda=args.gae_lambda,
+    )
+    returns = advantages + rollout.values
+    pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
+    logs, numbers = [], []
+    for _ in range(args.update_epochs):
+        for minibatch in pieces.minibatches(args.num_minibatches):
+            loss, log = minibatch_loss(agent, rollout, (advantages, returns), minibatch, ent_coef, args)
+            optimizer.zero_grad()
+            loss.backward()
+            log["losses/grad_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+            optimizer.step()
+            logs.append(log)
+            numbers.append(agent.memory.numbers(minibatch, rollout.memory))
+        epoch_kl = torch.stack([log["losses/approx_kl"] for log in logs[-args.num_minibatches :]]).mean()
+        if args.target_kl is not None and epoch_kl > args.target_kl:
+            break
+    means = {name: torch.stack([log[name] for log in logs]).mean().item() for name in logs[0]}
+    # Before the first gradient step the weights are the rollout's, and so must be every probability.
+    means["losses/ratio_error"] = logs[0]["losses/ratio_error"].item()
+    means["losses/explained_variance"] = explained_variance(rollout.values, returns)
+    return means | {f"charts/{name}": float(np.mean([each[name] for each in numbers])) for name in numbers[0]}
+
+
+def explained_variance(values: Tensor, returns: Tensor) -> float:
+    """Return the share of the returns' variance that the values explain; NaN if the returns do not vary."""
+    variance = returns.var().item()
+    return 1 - (returns - values).var().item() / variance if variance > 0 else math.nan
+
+
+@dataclass
+class Run:
+    """All that training needs, made by `setup` from an Args."""
+
+    envs: gym.vector.VectorEnv
+    agent: Agent
+    optimizer: torch.optim.Optimizer
+    rollout: Rollout
+    play: Play
+    recorder: LaneRecorder | None
+    folder: str
+    writer: SummaryWriter
+
+
+def setup(args: Args) -> Run:
+    """Check the arguments and make everything, the run folder last: bad input raises before anything is written.
+
+    Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
+    """
+    check_args(args)
+    torch.manual_seed(args.seed)
+    torch.backends.cudnn.deterministic = args.torch_deterministic
+    device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
+    options = reset_options(args.env_id, args.env_options)
+    envs = make_envs(args.env_id, args.num_envs, args.num_levels, args.start_level, args.capture_video)
+    if envs.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
+        raise ValueError(f"{args.env_id} does not reset an ended episode in the same step")
+    obs = first_reset(envs, args.seed, options)
+    agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(device)
+    if args.load_model is not None:
+        load_weights(agent, args.load_model)
+    optimizer = torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)
+    try:
+        rollout = make_rollout(agent, obs, args.num_steps, device)
+    except (MemoryError, RuntimeError):
+        size = f"--num-envs {args.num_envs} x --num-steps {args.num_steps}"
+        raise ValueError(f"a rollout of {size} does not fit in the memory of {device}; use fewer of either") from None
+    live = agent.memory.initial(args.num_envs, device)
+    play = Play(obs, live, np.zeros(args.num_envs), np.zeros(args.num_envs, np.int64))
+
+    folder = new_folder(args)
+    recorder = LaneRecorder(envs, os.path.join(folder, "videos")) if args.capture_video else None
+    if args.track:
+        start_tracking(args, os.path.basename(folder))
+    return Run(envs, agent, optimizer, rollout, play, recorder, folder, open_writer(args, folder))
+
+
+def new_folder(args: Args) -> str:
+    """Name a run folder that does not exist yet: a second run that begins in the same second gets a number."""
+    env_id = args.env_id.replace("/", "-").replace(":", "-")
+    folder = os.path.join("runs", f"{env_id}__{args.exp_name}__{args.seed}__{int(time.time())}")
+    numbered = (f"{folder}-{number}" for number in itertools.count(2))
+    return folder if not os.path.exists(folder) else next(name for name in numbered if not os.path.exists(name))
+
+
+def open_writer(args: Args, folder: str) -> SummaryWriter:
+    """Make the run folder and its TensorBoard file, which begins with the hyperparameters.
+
+    Raises OSError if the folder cannot be made.
+    """
+    try:
+        os.makedirs(folder)
+    except OSError as error:
+        raise OSError(f"cannot make {folder} ({error.strerror}); run where the folder runs can be written") from None
+    writer = SummaryWriter(folder)
+    rows = "\n".join(f"|{key}|{value}|" for key, value in asdict(args).items())
+    writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
+    return writer
+
+
+def start_tracking(args: Args, name: str) -> None:
+    """Mirror the TensorBoard curves to Weights and Biases; raise ValueError if that does not start."""
+    wandb = require("wandb", "--track", "track")
+    try:
+        wandb.init(
+            project=args.wandb_project_name,
+            entity=args.wandb_entity,
+            sync_tensorboard=True,
+            config=asdict(args),
+            name=name,
+            save_code=True,
+        )
+    except Exception as error:  # whatever wandb raises: no account, no such team, no network
+        raise ValueError(f"--track: {error}; log in with `wandb login`, or leave --track out") from None
+
+
+def train(args: Args, run: Run) -> str:
+    """Train for --total-timesteps, rounded down to whole iterations, or until Ctrl-C; return the run folder."""
+    recent = {"return": deque(maxlen=100), "length": deque(maxlen=100)}
+    batch_size = args.num_envs * args.num_steps
+    start = time.perf_counter()
+    bar = tqdm(total=args.total_timesteps // batch_size * batch_size, unit=" steps", unit_scale=True)
+    with bar, contextlib.suppress(KeyboardInterrupt):  # Ctrl-C ends the training early and keeps what was learned
+        for step in range(0, bar.total, batch_size):
+            lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
+            ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
+            run.optimizer.param_groups[0]["lr"] = lr
+            last_value, episodes = collect(run.agent, run.envs, run.play, run.rollout, args, run.recorder)
+            scalars = update(run.agent, run.optimizer, run.rollout, last_value, ent_coef, args)
+
+            bar.update(batch_size)
+            speed = bar.n / (time.perf_counter() - start)
+            scalars |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef, "charts/SPS": speed}
+            scalars |= {name: float(np.mean(values)) for name, values in episodes.items()}
+            for name, value in scalars.items():
+                run.writer.add_scalar(name, value, bar.n)
+            for name, window in recent.items():
+                window.extend(episodes.get(f"charts/episodic_{name}", []))
+            shown = {name: f"{np.mean(window):.2f}" for name, window in recent.items() if window}
+            bar.set_postfix({**shown, "SPS": f"{speed:.0f}"})
+    if args.save_model:
+        save_model(run.agent, args, os.path.join(run.folder, "model.pt"))
+    run.writer.close()
+    run.envs.close()
+    return run.folder
+
+
+def main(args: Args) -> str:
+    """Train an agent as the arguments say; return the run folder. Raises what `setup` raises."""
+    return train(args, setup(args))
+
+
+if __name__ == "__main__":
+    args = tyro.cli(Args)
+    try:
+        run = setup(args)
+    except (ValueError, OSError, ImportError, gym.error.Error) as error:
+        sys.exit(f"{os.path.basename(__file__)}: {' '.join(str(error).split())}")
+    train(args, run)

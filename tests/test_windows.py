@@ -1,0 +1,267 @@
+"""The Transformer-XL memory: its band attention against a loop over samples, its window's edges, its encodings."""
+
+import itertools
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from ppo_trxl import Args, Attention, Live, Memory, Timeline, sinusoid, visible
+
+ENCODINGS = ["absolute", "learned", "relative", "none"]
+STEPS, LANES, WIDTH = 24, 3, 8
+
+
+def make_memory(**changes):
+    """A small memory in float64 whose parameters are all random: zeros would hide a missing term."""
+    small = {"trxl_dim": WIDTH, "trxl_num_heads": 2, "trxl_num_layers": 2, "trxl_memory_length": 5, "num_steps": STEPS}
+    torch.manual_seed(0)
+    memory = Memory(Args(**{**small, "trxl_segment_length": 8, "trxl_pe_length": 64, **changes})).double()
+    for parameter in memory.parameters():
+        torch.nn.init.normal_(parameter, std=0.5)
+    return memory
+
+
+def make_timeline(memory, seed=1):
+    """Random items, and the steps of episodes that end at random; in lane 0 one also ends before the rollout."""
+    generator = torch.Generator().manual_seed(seed)
+    rows = memory.window + STEPS
+    items = torch.randn(rows, LANES, len(memory.blocks), WIDTH, dtype=torch.float64, generator=generator)
+    ends = torch.rand(rows, LANES, generator=generator) < 0.15
+    ends[memory.window, 0] = True
+    steps = torch.zeros(rows, LANES, dtype=torch.int64)
+    for row in range(1, rows):
+        steps[row] = (steps[row - 1] + 1).masked_fill(ends[row], 0)
+    return Timeline(items, steps)
+
+
+def naive(memory, x, row, lane, stored):
+    """One sample: gather its window, project it, attend with a softmax that is written out."""
+    step = int(stored.steps[row, lane])
+    window = min(step, memory.window)
+    at = torch.arange(row - window, row)
+    told = memory.query_encoding(stored.steps[row, lane], x.dtype)
+    for k, block in enumerate(memory.blocks):
+        attention = block.attention
+        items = stored.items[at, lane, k] + memory.position(stored.steps[at, lane], x.dtype)
+        normed, query = block.norm_items(items), block.norm_query(x + (told if k == 0 else 0.0))
+        heads, size = [], WIDTH // attention.heads
+        for h in range(attention.heads):
+            of = slice(h * size, (h + 1) * size)
+            w_q, w_k, w_v = (layer.weight[of].T for layer in (attention.query, attention.key, attention.value))
+            scores = query @ w_q @ (normed @ w_k).T
+            if memory.encoding == "relative":  # the four terms of (2.61)
+                r = sinusoid(row - at, WIDTH)
+                u, v = attention.content_bias, attention.position_bias
+                scores = scores + query @ w_q @ (r @ w_k).T + u @ w_q @ (normed @ w_k).T + v @ w_q @ (r @ w_k).T
+            heads.append((scores / math.sqrt(size)).softmax(-1) @ (normed @ w_v))
+        attended = attention.output(torch.cat(heads)) if window else torch.zeros_like(x)
+        x = block.merge_attention(x, attended)
+        x = block.merge_output(x, F.relu(block.projection(block.norm_output(x))))
+    return x
+
+
+VARIANTS = [
+    {"trxl_positional_encoding": encoding, "trxl_gate": gate, "trxl_memory_length": window}
+    for encoding, gate, window in itertools.product(ENCODINGS, ["none", "gru"], [1, 5, 13, 40])
+] + [{"trxl_positional_encoding": encoding, "trxl_query_position": True} for encoding in ENCODINGS]
+
+
+@pytest.mark.parametrize("changes", VARIANTS)
+def test_unroll_equals_a_window_gathered_for_every_sample(changes):
+    memory = make_memory(**changes)
+    stored = make_timeline(memory)
+    order = torch.randperm(LANES * math.ceil(STEPS / 8), generator=torch.Generator().manual_seed(2))
+    pieces = memory.cut(torch.zeros(STEPS, LANES, dtype=torch.bool))
+    pieces.first, pieces.length = pieces.first[order[:7]], pieces.length[order[:7]]
+    pieces.length[2] = 3  # padding
+    flat = pieces.steps().tolist()
+    x = torch.randn(len(flat), WIDTH, dtype=torch.float64, requires_grad=True)
+    wanted = torch.stack(
+        [naive(memory, x[i], memory.window + at // LANES, at % LANES, stored) for i, at in enumerate(flat)]
+    )
+    found = memory.unroll(x, pieces, stored)
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-10)
+    weight = torch.randn_like(wanted)
+    inputs = [x, *memory.parameters()]
+    gradients = [torch.autograd.grad((y * weight).sum(), inputs, allow_unused=True) for y in (found, wanted)]
+    for got, want in zip(*gradients, strict=True):
+        torch.testing.assert_close(got, want, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("window", [3, 40])
+def test_playing_equals_unrolling(encoding, window):
+    """Three rollouts, refreshed in between: an episode of lane 0 spans them all, others end inside them."""
+    memory = make_memory(trxl_positional_encoding=encoding, trxl_memory_length=window, trxl_pe_length=80)
+    live, stored = memory.initial(LANES, torch.device("cpu")), memory.storage(STEPS, LANES, torch.device("cpu"))
+    live.keys, live.values, stored.items = live.keys.double(), live.values.double(), stored.items.double()
+    generator = torch.Generator().manual_seed(3)
+    for _ in range(3):
+        x = torch.randn(STEPS, LANES, WIDTH, dtype=torch.float64, generator=generator)
+        done = torch.rand(STEPS, LANES, generator=generator) < 0.1
+        done[:, 0] = False
+        played = []
+        with torch.no_grad():
+            live = memory.refresh(live, stored)
+            for t in range(STEPS):
+                y, live, item = memory.step(x[t], live)
+                memory.store(stored, t, item)
+                live = memory.reset(live, done[t])
+                played.append(y)
+        pieces = memory.cut(done)
+        unrolled = memory.unroll(x.flatten(0, 1)[pieces.steps()], pieces, stored)
+        torch.testing.assert_close(unrolled, torch.stack(played).flatten(0, 1)[pieces.steps()], rtol=0, atol=1e-10)
+        with torch.no_grad():
+            for parameter in memory.parameters():
+                parameter.mul_(0.9)  # the cache has to be made anew
+    assert live.steps[0] == 3 * STEPS
+
+
+def test_window_edges():
+    age = torch.arange(-1, 8)
+    for step, seen in {
+        0: [],
+        1: [1],
+        4: [1, 2, 3, 4],
+        5: [1, 2, 3, 4, 5],
+        6: [1, 2, 3, 4, 5],
+        99: [1, 2, 3, 4, 5],
+    }.items():
+        assert age[visible(age, torch.tensor(step), 5)].tolist() == seen
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_attention_weights_are_those_that_were_used(encoding):
+    torch.manual_seed(0)
+    attention = Attention(WIDTH, 2, encoding == "relative").double()
+    x, keys, values = (torch.randn(4, length, WIDTH, dtype=torch.float64) for length in (3, 6, 6))
+    age = 3 + torch.arange(3)[:, None] - torch.arange(6)
+    seen = visible(age, torch.tensor([0, 1, 2, 3])[:, None, None] + torch.arange(3)[:, None], 4)
+    weights = attention.weights(x, keys, age, seen)
+    assert weights[0, :, 0].eq(0).all(), "the first step of an episode looks at nothing"
+    torch.testing.assert_close(weights.sum(-1)[1:], torch.ones(3, 2, 3, dtype=torch.float64))
+    assert (weights > 0).equal(seen[:, None].expand_as(weights))
+    heads = (weights @ attention.split(values)).transpose(1, 2).flatten(2)
+    used = attention(x, keys, values, age, seen)
+    torch.testing.assert_close(attention.output(heads)[seen.any(-1)], used[seen.any(-1)], rtol=0, atol=1e-12)
+    assert used[~seen.any(-1)].eq(0).all()
+
+
+def test_attention_equals_the_library_s():
+    torch.manual_seed(0)
+    attention, library = Attention(WIDTH, 2, False), torch.nn.MultiheadAttention(WIDTH, 2, batch_first=True)
+    parts = (attention.query.weight, attention.key.weight, attention.value.weight)
+    library.load_state_dict(
+        {
+            "in_proj_weight": torch.cat(parts),
+            "in_proj_bias": torch.zeros(3 * WIDTH),
+            "out_proj.weight": attention.output.weight,
+            "out_proj.bias": attention.output.bias,
+        }
+    )
+    x, items = torch.randn(2, 3, WIDTH), torch.randn(2, 7, WIDTH)
+    seen = torch.rand(3, 7) < 0.5
+    seen[:, 0] = True
+    wanted, weights = library(x, items, items, attn_mask=~seen, average_attn_weights=False)
+    age, seen = torch.ones(3, 7, dtype=torch.int64), seen.expand(2, 3, 7)
+    torch.testing.assert_close(attention(x, attention.key(items), attention.value(items), age, seen), wanted)
+    torch.testing.assert_close(attention.weights(x, attention.key(items), age, seen), weights)
+
+
+def test_attention_of_a_step():
+    memory = make_memory(trxl_positional_encoding="relative")
+    live = memory.initial(LANES, torch.device("cpu"))
+    live.keys, live.values = live.keys.double(), live.values.double()
+    for t in range(9):
+        x = torch.randn(LANES, WIDTH, dtype=torch.float64)
+        weights = memory.attention(x, live)
+        assert weights.shape == (LANES, 2, 2, min(max(t, 1), 5))
+        torch.testing.assert_close(weights.sum(-1), torch.full((LANES, 2, 2), float(t > 0), dtype=torch.float64))
+        with torch.no_grad():
+            _, live, _ = memory.step(x, live)
+
+
+@pytest.mark.parametrize("fill", [1e6, math.nan])
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_what_is_not_seen_changes_nothing(encoding, fill):
+    memory = make_memory(trxl_positional_encoding=encoding)
+    stored = make_timeline(memory)
+    pieces = memory.cut(torch.zeros(STEPS, LANES, dtype=torch.bool))
+    x = torch.randn(STEPS * LANES, WIDTH, dtype=torch.float64)
+
+    def learn():
+        memory.zero_grad()
+        y = memory.unroll(x, pieces, stored)
+        y.square().sum().backward()
+        return [y.detach(), *(parameter.grad for parameter in memory.parameters())]
+
+    clean = learn()
+    stored.items[: memory.window, 0] = fill
+    for lane in range(LANES):
+        ends = (stored.steps[1:, lane] == 0).nonzero()[:, 0]
+        stored.items[ends[ends >= memory.window], lane] = fill  # an episode's last item is seen by none
+    assert (stored.items != stored.items.clamp(-1e5, 1e5)).sum() > 50
+    for got, want in zip(learn(), clean, strict=True):
+        assert got.equal(want)
+
+
+def test_a_forgotten_episode_leaves_nothing_in_the_cache():
+    memory = make_memory()
+    live = memory.initial(2, torch.device("cpu"))
+    live.keys, live.values = live.keys.double(), live.values.double()
+    with torch.no_grad():
+        for _ in range(4):
+            _, live, _ = memory.step(torch.full((2, WIDTH), math.nan).double(), live)
+        live = memory.reset(live, torch.tensor([True, True]))
+        for _ in range(7):
+            y, live, _ = memory.step(torch.randn(2, WIDTH).double(), live)
+            assert y.isfinite().all()
+
+
+def test_taking_a_step_again_changes_nothing():
+    memory = make_memory()
+    live = memory.initial(LANES, torch.device("cpu"))
+    live.keys, live.values = live.keys.double(), live.values.double()
+    with torch.no_grad():
+        for _ in range(8):
+            x, other = torch.randn(2, LANES, WIDTH).double()
+            first = memory.step(x, live)[0]
+            memory.step(other, live)
+            again, live, _ = memory.step(x, live)
+            assert first.equal(again)
+
+
+def test_episodes_longer_than_a_learned_encoding():
+    for encoding in ENCODINGS:
+        memory = make_memory(trxl_positional_encoding=encoding, trxl_pe_length=6)
+        live = memory.initial(1, torch.device("cpu"))
+        live = Live(live.now, live.steps + 5, live.keys.double(), live.values.double())
+        with torch.no_grad():
+            _, live, _ = memory.step(torch.randn(1, WIDTH).double(), live)
+            if encoding == "learned":
+                with pytest.raises(ValueError, match="--trxl-pe-length is 6, but an episode is longer"):
+                    memory.step(torch.randn(1, WIDTH).double(), live)
+            else:
+                memory.step(torch.randn(1, WIDTH).double(), live)
+
+
+def test_sinusoid():
+    at = sinusoid(torch.tensor([0, 1, 5000]), 4)
+    assert at[0].tolist() == [0, 1, 0, 1]
+    angles = [5000, math.cos(5000), 5000 / 100]
+    torch.testing.assert_close(
+        at[2], torch.tensor([math.sin(angles[0]), angles[1], math.sin(angles[2]), math.cos(angles[2])]).double()
+    )
+
+
+@pytest.mark.parametrize("scheme", ["xavier", "orthogonal", "kaiming", "tfixup"])
+def test_initialization(scheme):
+    torch.manual_seed(0)
+    block = Memory(Args(trxl_init=scheme, trxl_num_layers=4)).blocks[0]
+    deviation = {"xavier": 384**-0.5, "orthogonal": 384**-0.5, "kaiming": (2 / 384) ** 0.5, "tfixup": 384**-0.5}[scheme]
+    scale = 0.67 * 4**-0.25 if scheme == "tfixup" else 1.0
+    assert block.attention.query.weight.std().item() == pytest.approx(deviation, rel=0.02)
+    assert block.projection.weight.std().item() == pytest.approx(deviation * scale, rel=0.02)
+    assert block.projection.bias.eq(0).all()
