@@ -46,11 +46,9 @@ OPTIONS = {  # played one after the other, each by the ids that have its options
     SearingSpotlights: [
         {},
         {"initial_spawns": 0, "num_spawns": 0},
+        {"initial_spawns": 0, "num_spawns": 0, "coins_visible": True, "num_coins": [5]},
         {"initial_spawns": 1, "spot_damage": 0.0, "light_dim_off_duration": 0},
-        {"agent_visible": True, "initial_spawns": 2},
-        {"black_background": True, "hide_chessboard": True, "spot_damage": 0.0},
-        {"light_threshold": 100, "visual_feedback": False},
-        {"coins_visible": True, "num_coins": [5]},
+        {"initial_spawns": 1, "spot_damage": 0.0, "black_background": True, "hide_chessboard": True},
     ],
 }
 CASES = [
@@ -127,6 +125,8 @@ def look(env_id, options, **state):
     # All lanes have the same level, but for what is set.
     for name in envs.state.__dataclass_fields__:
         field = getattr(envs.state, name)
+        if field.dtype == object:  # lists, of what no frame shows
+            continue
         field[:] = state.get(name, field[0] if len(field) else field)
     return envs, check(zip(unique(envs.frames(ALL)), envs.vectors(ALL), envs.ground_truth(), strict=True))
 
