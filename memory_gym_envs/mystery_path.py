@@ -29,6 +29,7 @@ from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, magnify, make_she
 from memory_gym_envs.entries import Entries, vector_slices
 from memory_gym_envs.looks import LARGEST, Looks, View, agent_entries, covered, look, make_looks
 from memory_gym_envs.options import Option
+from memory_gym_envs.words import Tape, below
 
 TILE = 12  # pixels
 SIDE = 7  # tiles along one side of the screen, and of a segment of the endless path
@@ -45,12 +46,13 @@ PIT = 0  # the step of the path at places that are none; the path's own steps co
 NOWHERE = -1  # the cell of that step
 FAR = 14  # pixels: who walks further in a step can leave the stored positions
 NO_STEP = -1  # where an agent is while it is put back
+REACHED = -1  # of steps without a reward for reaching them first
 TILE_AT = (np.arange(SPAN) - PAD) // TILE  # of stored positions on the screen
 BRANCHES = np.array([3, 1])  # numbers the actions of two branches
 
 EAST, NORTH, SOUTH, WEST = range(4)
-HEADINGS = np.zeros(2 * ROWS + 1, np.int64)  # by ROWS + the difference of two cells
-HEADINGS[[ROWS + ROWS, ROWS - 1, ROWS + 1, ROWS - ROWS]] = EAST, NORTH, SOUTH, WEST
+HEADINGS = np.zeros(2 * ROWS + 1, np.int64)  # by the difference of two cells, counted from the end if negative
+HEADINGS[[ROWS, -1, 1, -ROWS]] = EAST, NORTH, SOUTH, WEST
 
 
 # ---- configuration ----
@@ -149,17 +151,16 @@ class State:
     fallen: np.ndarray  # (N,) bool: in the pit, and so put back at the next step
     count: np.ndarray  # (N,) steps of the path; the last one is the goal
     cell: np.ndarray  # (N, P) where each step of the path is, NOWHERE at first
-    heading_at: np.ndarray  # (N, P) uint8: the direction of the next step
-    fresh: np.ndarray  # (N, P) bool: the step has a reward for reaching it
-    restful: np.ndarray  # (N, P) bool: the step gives stamina back
+    heading_at: np.ndarray  # (N, P) the direction of the next step
+    reached: np.ndarray  # (N, P) 1 + how often the agent had fallen off when it last was there; 0: never; or REACHED
     step_at: np.ndarray  # (N, M) the inverse of cell: the step of the path that is there, or PIT
-    past: np.ndarray  # (N,) bool: something of the path behind the agent is shown
+    past: np.ndarray  # (N,) bool: the path behind the agent, if there is any, is shown
     trail_lane: np.ndarray  # (m,) the lane of each tile of the path that is shown behind any agent
     trail_x: np.ndarray  # (m,) its first pixel, counted along the path
     trail_y: np.ndarray  # (m,)
     hurt: np.ndarray  # (N,) bool: in the pit, and a cross shows it
     known: np.ndarray  # (N, M) bool: the agent fell off there before
-    walls: np.ndarray  # (N, S) each segment's untraceable places, a bit set
+    walls: np.ndarray  # (N,) object: the untraceable places of each segment, a list of lists
     segments: np.ndarray  # (N,)
     furthest: np.ndarray  # (N,) the rightmost column of the path reached so far
     stamina: np.ndarray  # (N,) steps left to reach another tile
@@ -194,11 +195,11 @@ def empty_state(lanes: int, segments: int) -> State:
     """The state of N lanes before their first reset, with room for this many segments."""
     steps, cells = (SIDE * SIDE + 1,), (segments * SEGMENT * ROWS,)
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("pos", "origin", "tile"), (2,))
-    shapes |= {"walls": (segments,), "speed": (1,), "step_at": cells, "known": cells}
-    shapes |= dict.fromkeys(("cell", "heading_at", "fresh", "restful"), steps)
-    flags = ("fallen", "past", "hurt", "cross_fits", "fresh", "restful", "known", "extras", "feedback")
+    shapes |= {"speed": (1,), "step_at": cells, "known": cells}
+    shapes |= dict.fromkeys(("cell", "heading_at", "reached"), steps)
+    flags = ("fallen", "past", "hurt", "cross_fits", "known", "extras", "feedback")
     kinds: dict[str, Any] = dict.fromkeys((*flags, *(f"show_{what}" for what in SHOWN)), bool)
-    kinds |= dict.fromkeys(("returned", "camera"), np.float64) | {"heading_at": np.uint8}
+    kinds |= dict.fromkeys(("returned", "camera"), np.float64) | {"walls": object}
     kinds |= dict.fromkeys(("reward_goal", "reward_fall_off", "reward_progress", "reward_step"), np.float64)
     names = State.__dataclass_fields__
     s = State(**{name: np.zeros((lanes, *shapes.get(name, ())), kinds.get(name, np.int64)) for name in names})
@@ -218,21 +219,21 @@ SHOWN = {
 
 def make_room(s: State, steps: int, segments: int) -> bool:
     """Widens the state if it cannot hold a path of so many steps and segments; whether it had to."""
-    if steps < s.cell.shape[1] and segments <= s.walls.shape[1]:
+    room = s.known.shape[1] // (SEGMENT * ROWS)
+    if steps < s.cell.shape[1] and segments <= room:
         return False
     # By half as much again at least, so that an ever longer path seldom has to move.
-    steps, segments = max(steps + 1, s.cell.shape[1] * 3 // 2), max(segments, s.walls.shape[1] * 3 // 2)
-    for name in ("cell", "heading_at", "fresh", "restful"):
+    steps, segments = max(steps + 1, s.cell.shape[1] * 3 // 2), max(segments, room * 3 // 2)
+    for name in ("cell", "heading_at", "reached"):
         setattr(s, name, widened(getattr(s, name), steps))
     for name in ("step_at", "known"):
         setattr(s, name, widened(getattr(s, name), segments * SEGMENT * ROWS))
-    s.walls = widened(s.walls, segments)
     return True
 
 
 # ---- levels ----
 
-# While a path is drawn, a place is column * SIDE + row of a 7 x 7 grid, and a set of places is an integer's bits.
+# While a path is drawn, a place is column * SIDE + row of a 7 x 7 grid.
 PLACES = [divmod(place, SIDE) for place in range(SIDE * SIDE)]
 CELLS = [column * ROWS + BEYOND + row for column, row in PLACES]
 STRAIGHT = ((1, 0), (-1, 0), (0, 1), (0, -1))  # in the original's order
@@ -244,87 +245,57 @@ def _neighbours(x: int, y: int, moves: tuple[tuple[int, int], ...]) -> list[int]
     return [spot[0] * SIDE + spot[1] for spot in spots if spot in PLACES]
 
 
-def _bits(places: list[int]) -> int:
-    return sum(1 << place for place in places)
-
-
-NEIGHBOURS = [[(place, 1 << place) for place in _neighbours(x, y, STRAIGHT)] for x, y in PLACES]
-NEAR = [_bits(_neighbours(x, y, ((0, 0), *STRAIGHT))) for x, y in PLACES]
-# Every inner place that may become a wall, with the eight around it; and the places of the border.
-INSIDE = [
-    (1 << place, _bits(_neighbours(x, y, STRAIGHT + OBLIQUE)))
-    for place, (x, y) in enumerate(PLACES)
-    if 0 < x < SIDE - 2 and 0 < y < SIDE - 2
-]
-BORDER = [1 << place for place, spot in enumerate(PLACES) if 0 in spot or SIDE - 1 in spot]
+NEIGHBOURS = [_neighbours(x, y, STRAIGHT) for x, y in PLACES]
 DISTANCES = [[math.sqrt((a - x) ** 2 + (b - y) ** 2) for a, b in PLACES] for x, y in PLACES]
 
+# Places that may become walls. Of the border's, a set is an integer's bits, and eight of them are a look-up.
+INSIDE = [place for place, (x, y) in enumerate(PLACES) if 0 < x < SIDE - 2 and 0 < y < SIDE - 2]
+BORDER = [place for place, spot in enumerate(PLACES) if 0 in spot or SIDE - 1 in spot]
+
+
+def _border_bits(places: list[int]) -> int:
+    return sum(1 << at for at, place in enumerate(BORDER) if place in places)
+
+
+NEAR = [_border_bits(_neighbours(x, y, ((0, 0), *STRAIGHT))) for x, y in PLACES]
+AROUND = [_border_bits(_neighbours(x, y, STRAIGHT + OBLIQUE)) for x, y in PLACES]
+FREE = [[[BORDER[first + at] for at in range(8) if not kept >> at & 1] for kept in range(256)] for first in (0, 8, 16)]
+CLOSED, UNREACHED = 0, 1 << 20  # in place of a cost
 
 WALLS = 33  # the chance of a wall in percent
-# In 32-bit words: below which one that is, and the few for which a number below 100 is drawn again.
-WALL_WORDS = -((-WALLS << 32) // 100)
-AGAIN = {word for part in range(100) if (word := -((-part << 32) // 100)) * 100 % (1 << 32) < (1 << 32) % 100}
-
-
-class Tape:
-    """What a generator is about to draw, read ahead: a path takes a hundred numbers, and asking for each is slow.
-
-    All bounded integers are made of the generator's 32-bit words, which are drawn here at once. In the end, the
-    generator goes back and draws those that were used.
-    """
-
-    def __init__(self, rng: np.random.Generator, paths: int):
-        self.rng, self.before, self.used = rng, rng.bit_generator.state, 0
-        # A path takes 113 words at most, and one more for every number in ten million, which is drawn again.
-        self.words = rng.integers(0, 1 << 32, 120 * paths, np.uint32).tolist()
-
-    def below(self, limit: int) -> int:
-        """What Generator.integers(0, limit) would draw (Lemire's method)."""
-        if limit == 1:
-            return 0
-        while True:
-            product = self.words[self.used] * limit
-            self.used += 1
-            if (product & 0xFFFFFFFF) >= limit or (product & 0xFFFFFFFF) >= (1 << 32) % limit:
-                return product >> 32
-
-    def chances(self, count: int) -> list[bool]:
-        """Of so many numbers below 100, which are below WALLS."""
-        words = self.words[self.used : self.used + count]
-        if not AGAIN.isdisjoint(words):
-            return [self.below(100) < WALLS for _ in range(count)]
-        self.used += count
-        return [word < WALL_WORDS for word in words]
-
-    def close(self) -> None:
-        """Leaves the generator as if it had drawn the used words only."""
-        self.rng.bit_generator.state = self.before
-        self.rng.integers(0, 1 << 32, self.used, np.uint32)
+# Draws of a path: origin's side, start, end, the inside, how many and which of the border, and one for each two places.
+DRAWS = 3 + len(INSIDE) + 1 + 8 + 2 * SIDE * (SIDE - 1)
+SPARE = 7  # for numbers that are drawn again, one in ten million
 
 
 class Level(NamedTuple):
     """What the generator decides at a reset, and for every further segment of an endless path."""
 
     path: list[int]  # its cells, from the origin to the goal
-    walls: list[int]  # the untraceable places of each segment
+    walls: list[list[int]]  # the untraceable places of each segment
+
+
+def read_ahead(rng: np.random.Generator, paths: int) -> Tape:
+    """The words that so many paths may take. Asking the generator for one at a time is slow."""
+    return Tape(rng, paths * (DRAWS + SPARE))
 
 
 def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
     """Draws a level in the original's order, so that its seeds mean the same here."""
-    tape = Tape(rng, FIRST_SEGMENTS if variant.endless else 1)
+    tape = read_ahead(rng, FIRST_SEGMENTS if variant.endless else 1)
     if variant.endless:
-        level = draw_segments(tape, tape.below(SIDE), 0, FIRST_SEGMENTS)
+        level = draw_segments(tape, below(tape, SIDE), 0, FIRST_SEGMENTS)
     else:
         choices = values["cardinal_origin_choice"]
-        side = choices[tape.below(len(choices))]
-        start, end = tape.below(SIDE), tape.below(SIDE)
+        side = choices[below(tape, len(choices))] if len(choices) > 1 else choices[0]
+        start, end = below(tape, SIDE), below(tape, SIDE)
         near, far = (0, SIDE - 1) if side in (0, 2) else (SIDE - 1, 0)
         if side in (0, 1):
             start, end = near * SIDE + start, far * SIDE + end
         else:
             start, end = start * SIDE + near, end * SIDE + far
         walls = draw_walls(tape, start, end)
-        level = Level([CELLS[place] for place in draw_path(tape, walls, start, end)], [walls])
+        level = Level(cells_of(draw_path(tape, walls, start, end), 0), [walls])
     tape.close()
     return level
 
@@ -333,60 +304,59 @@ def draw_segments(tape: Tape, row: int, first: int, count: int) -> Level:
     """Draws segments of an endless path, from this row on, the first of them being segment number `first`."""
     path, every_wall = [], []
     for segment in range(first, first + count):
-        start, end = row, (SIDE - 1) * SIDE + tape.below(SIDE)
+        start, end = row, (SIDE - 1) * SIDE + below(tape, SIDE)
         walls = draw_walls(tape, start, end)
-        shift = segment * SEGMENT * ROWS
-        path += [CELLS[place] + shift for place in draw_path(tape, walls, start, end)]
+        path += cells_of(draw_path(tape, walls, start, end), segment)
         path.append(path[-1] + ROWS)  # the transition tile
         every_wall.append(walls)
         row = end % SIDE
     return Level(path, every_wall)
 
 
-def draw_walls(tape: Tape, start: int, end: int) -> int:
-    """A set of untraceable places: some inside, some on the border that touch neither those nor start and end.
+def draw_walls(tape: Tape, start: int, end: int) -> list[int]:
+    """Untraceable places: some inside, some on the border that touch neither those nor start and end.
 
     So there always is a path: along the border, and one ring further inside past the walls that stand there.
     """
-    walls, kept_free = 0, NEAR[start] | NEAR[end]
-    for (place, around), hit in zip(INSIDE, tape.chances(len(INSIDE)), strict=True):
-        if hit:
-            walls |= place
-            kept_free |= around
-    free = [place for place in BORDER if not place & kept_free]
-    for _ in range((4, 8)[tape.below(2)]):
-        if free:
-            walls |= free.pop(tape.below(len(free)))
-    return walls
+    walls, kept_free = tape.hits(INSIDE, WALLS), NEAR[start] | NEAR[end]
+    for place in walls:
+        kept_free |= AROUND[place]
+    free = FREE[0][kept_free & 255] + FREE[1][kept_free >> 8 & 255] + FREE[2][kept_free >> 16]
+    return walls + tape.picks(free, (4, 8)[below(tape, 2)])
 
 
-def draw_path(tape: Tape, walls: int, start: int, end: int) -> list[int]:
+def draw_path(tape: Tape, walls: list[int], start: int, end: int) -> list[int]:
     """The path that A* finds over random costs, not always the cheapest: its places from start to end."""
-    words, used, closed = tape.words, tape.used, walls
-    cost, total, previous = [0] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
-    distance, opened, here = DISTANCES[end], [], start
+    costs, used, distance = tape.eighths, tape.used, DISTANCES[end]
+    cost, total, previous = [UNREACHED] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
+    for place in walls:
+        cost[place] = CLOSED
+    opened, first, here, so_far = [], None, start, 1
     while here != end:
-        closed |= 1 << here
-        so_far = cost[here] + 1
-        for place, bit in NEIGHBOURS[here]:
-            if closed & bit:
-                continue
-            there = so_far + (words[used] >> 29)  # a cost of 1 to 8
-            used += 1
-            if not cost[place]:
-                cost[place], total[place], previous[place] = there, there + distance[place], here
-                opened.append(place)
-            elif there < cost[place]:
-                # The original leaves the higher cost as it is.
-                previous[place] = here
-        # Not the least total: the first that is less than the first of all, as in the original.
-        here = opened[0]
-        least = total[here]
-        for place in opened:
-            if total[place] < least:
-                here = place
+        cost[here] = CLOSED
+        for place in NEIGHBOURS[here]:
+            if cost[place]:
+                there = so_far + costs[used]  # a cost of 1 to 8
+                used += 1
+                if cost[place] == UNREACHED:
+                    cost[place], total[place], previous[place] = there, there + distance[place], here
+                    opened.append(place)
+                elif there < cost[place]:
+                    # The original leaves the higher cost as it is.
+                    previous[place] = here
+        # Next is not the least total, but as in the original the first in line that is less than that of the very
+        # first, else the very first. So no one needs to be compared with it twice.
+        if first is None:
+            waiting, passed = iter(opened), []
+            first = next(waiting)
+            least = total[first]
+        for here in waiting:
+            if total[here] < least:
                 break
-        opened.remove(here)
+            passed.append(here)
+        else:
+            here, first, opened = first, None, passed
+        so_far = cost[here] + 1
     tape.used = used
     path = [end]
     while here != start:
@@ -395,18 +365,28 @@ def draw_path(tape: Tape, walls: int, start: int, end: int) -> list[int]:
     return path[::-1]
 
 
+def cells_of(places: list[int], segment: int) -> list[int]:
+    """The map's cells of this segment's places."""
+    shift = segment * SEGMENT * ROWS
+    return [CELLS[place] + shift for place in places]
+
+
 def write_level(s: State, lane: int, level: Level, values: dict[str, Any], variant: Variant) -> None:
     """Starts the lane's episode at this level."""
     s.step_at[lane] = PIT
-    s.known[lane] = s.fallen[lane] = s.hurt[lane] = s.fresh[lane] = s.restful[lane] = False
+    s.known[lane] = s.fallen[lane] = s.hurt[lane] = False
     if s.past[lane]:
         s.past[lane] = False
         others = s.trail_lane != lane
         s.trail_lane, s.trail_x, s.trail_y = s.trail_lane[others], s.trail_x[others], s.trail_y[others]
     s.count[lane] = s.segments[lane] = s.furthest[lane] = s.fails[lane] = s.visited[lane] = 0
     s.length[lane] = s.returned[lane] = 0
+    s.walls[lane] = []
     write_path(s, lane, level, variant)
-    s.fresh[lane, 1] = False
+    s.reached[lane] = 0
+    s.reached[lane, PIT] = s.reached[lane, 1] = REACHED
+    if not variant.endless:
+        s.reached[lane, len(level.path)] = REACHED  # the goal has a reward of its own
     radius = radius_of(0.25 if variant.grid else values["agent_scale"])
     for axis, start in enumerate(divmod(level.path[0] - BEYOND, ROWS)):
         # Not the tile's middle but for the default size, as in the original.
@@ -420,20 +400,17 @@ def write_level(s: State, lane: int, level: Level, values: dict[str, Any], varia
 
 def write_path(s: State, lane: int, level: Level, variant: Variant) -> None:
     """Appends to the lane's path, for which there must be room."""
-    first, segment = int(s.count[lane]) + 1, int(s.segments[lane])
-    last, path = first + len(level.path), np.array(level.path)
-    s.cell[lane, first:last] = path
-    s.step_at[lane, path] = np.arange(first, last)
-    headings = HEADINGS.take(path[1:] - path[:-1] + ROWS)
-    s.heading_at[lane, first : last - 1] = headings
+    first = int(s.count[lane]) + 1
+    last = first + len(level.path)
+    s.cell[lane, first:last] = level.path
+    path = s.cell[lane, first:last]
+    s.step_at[lane][path] = np.arange(first, last)
+    s.heading_at[lane, first : last - 1] = HEADINGS[path[1:] - path[:-1]]
     # Behind a transition tile the path goes on to the right. The goal has the direction that leads to it.
-    s.heading_at[lane, last - 1] = EAST if variant.endless else headings[-1]
-    s.fresh[lane, first:last] = s.restful[lane, first:last] = True
-    s.walls[lane, segment : segment + len(level.walls)] = level.walls
+    s.heading_at[lane, last - 1] = EAST if variant.endless else s.heading_at[lane, last - 2]
     s.count[lane] = last - 1
-    s.segments[lane] = segment + len(level.walls)
-    if not variant.endless:
-        s.fresh[lane, last - 1] = False  # the goal has a reward of its own
+    s.segments[lane] += len(level.walls)
+    s.walls[lane] += level.walls
 
 
 # ---- drawing ----
@@ -683,12 +660,16 @@ def land(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: bool) ->
     lane_path: (N,) where the lane's steps start in the flattened path. rewards: (N,), changed in place.
     """
     s.at = np.where(s.fallen, s.at, s.step)
-    here = s.step + lane_path
-    fresh = s.fresh.take(here)
+    here, now = s.step + lane_path, s.fails + 1
+    before = s.reached.take(here)
+    fresh = before == 0
     if np.count_nonzero(fresh):
         rewards += fresh * s.reward_progress
         s.visited += fresh
-        s.fresh.put(here, False)
+    if endless:
+        # The first time since the last fall, a tile gives stamina back. So does the origin.
+        np.copyto(s.stamina, s.stamina_level, where=before != now)
+    s.reached.put(here, now)
     if np.count_nonzero(s.fallen):
         rewards += s.fallen * s.reward_fall_off
         s.fails += s.fallen
@@ -696,55 +677,44 @@ def land(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: bool) ->
     heading = s.heading_at.take(s.at + lane_path)
     if endless:
         # The ground truth has no entry for the west.
-        heading = np.where(heading == WEST, s.heading, heading)
-        s.past = s.show_past & (np.minimum(s.tile[:, 0], s.at - 1) > 0)
-        follow(s)
+        np.copyto(heading, s.heading, where=heading == WEST)
+        s.past = s.show_past & (s.tile[:, 0] > 0)
+        follow(s, lane_path)
     s.heading = heading
 
 
-def follow(s: State) -> None:
+def follow(s: State, lane_path: np.ndarray) -> None:
     """Finds the path behind the agents that is shown."""
     (lanes,) = s.past.nonzero()
     if lanes.size:
-        owner, cell = trail(s, lanes)
+        s.trail_lane, cell = trail(s, lanes, lane_path)
         column, row = np.divmod(cell, ROWS)
-        s.trail_lane, s.trail_x, s.trail_y = lanes[owner], column * TILE, (row - BEYOND) * TILE
+        s.trail_x, s.trail_y = column * TILE, (row - BEYOND) * TILE
 
 
-def trail(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The path behind the agents: for each tile, (m,), which of the lanes it belongs to, and its cell.
+def trail(s: State, lanes: np.ndarray, lane_path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The path behind the agents of the lanes: for each tile, (m,), its lane and its cell.
 
     From the last step but one backwards, up to the first that is as far to the left as the camera's offset in tiles.
     """
-    at = s.at[lanes]
-    bound = np.maximum(s.tile[lanes, 0] - s.depth[lanes], 1) * ROWS  # (n,) cells below that are far enough left
+    at = s.at.take(lanes)
+    bound = np.maximum(s.tile[:, 0] - s.depth, 1).take(lanes) * ROWS  # (n,) cells below that are far enough left
     back = BACK[: int(at.max())]  # (K,)
-    steps = at[:, None] - back  # (n, K)
-    np.maximum(steps, PIT, out=steps)
-    cells = s.cell.take(steps + lanes[:, None] * s.cell.shape[1])  # (n, K)
-    # At the latest, a trail ends at the pit, whose cell is left of everything.
-    last = (cells < bound[:, None]).argmax(axis=1)  # (n,)
-    owner, which = np.nonzero((back <= last[:, None] + 1) & (cells != NOWHERE))
-    return owner, cells[owner, which]
-
-
-def rest(s: State, lane_path: np.ndarray) -> None:
-    """The endless id: gives stamina back on a tile for the first time since the last fall. So does the origin."""
-    here = s.step + lane_path
-    np.copyto(s.stamina, s.stamina_level, where=s.restful.take(here))
-    s.restful.put(here, False)
+    # What is before the pit is of another lane, but nobody gets there: the pit's cell is left of everything.
+    cells = s.cell.take((at + lane_path.take(lanes))[:, None] - back)  # (n, K)
+    count = (cells < bound[:, None]).argmax(axis=1) + 1  # (n,)
+    np.minimum(count, at - 1, out=count)
+    return lanes.repeat(count), cells[back <= count[:, None]]
 
 
 def fall(s: State, cell: np.ndarray) -> np.ndarray:
-    """The endless id: gives stamina back to those in the pit; (N,) bool whose fall ends the episode.
+    """The endless id: who fell off where the episode ends, (N,) bool.
 
     cell: (N,) the agents' places in the flattened map.
     """
     over = s.fallen & ((s.tile[:, 0] < s.furthest) | s.known.take(cell))
     # Never forgotten: the original means to, on progress, but compares before there can be any.
     s.known.put(cell[s.fallen], True)
-    s.restful[s.fallen, 1:] = True
-    np.copyto(s.stamina, s.stamina_level, where=s.fallen)
     return over
 
 
@@ -905,7 +875,6 @@ class MysteryPath(MemoryGymVectorEnv):
         if not landed:
             s.stamina -= 1
             return s.stamina == 0
-        rest(s, self._lane_path)
         over = fall(s, cell) if np.count_nonzero(s.fallen) else False
         s.furthest = np.where(s.fallen, s.furthest, np.maximum(s.furthest, s.tile[:, 0]))
         s.stamina -= 1
@@ -934,7 +903,7 @@ class MysteryPath(MemoryGymVectorEnv):
         for lane in np.flatnonzero(entered).tolist():
             steps, segments = int(s.count[lane]), int(s.segments[lane])
             row = int(s.cell[lane, steps]) % ROWS - BEYOND
-            tape = Tape(self._rngs[lane], 1)
+            tape = read_ahead(self._rngs[lane], 1)
             level = draw_segments(tape, row, segments, 1)
             tape.close()
             if make_room(s, steps + len(level.path), segments + 1):
@@ -998,9 +967,8 @@ class MysteryPath(MemoryGymVectorEnv):
         marks[0] = (marks[0][0], ORIGIN)
         if not endless:
             marks[-1] = (marks[-1][0], GOAL)
-        for segment, walls in enumerate(s.walls[lane, : s.segments[lane]].tolist()):
-            shift = segment * SEGMENT * ROWS
-            marks += [(CELLS[place] + shift, WALL) for place in range(SIDE * SIDE) if walls >> place & 1]
+        for segment, walls in enumerate(s.walls[lane]):
+            marks += [(cell, WALL) for cell in cells_of(walls, segment)]
         camera = int(s.pos[lane, 0] - s.origin[lane, 0] - s.camera[lane]) if endless else 0
         for cell, kind in marks:
             centre = tile_centres(np.array([cell])) - (camera, 0)

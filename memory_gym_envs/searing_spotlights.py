@@ -12,6 +12,23 @@ import gymnasium as gym
 import numpy as np
 
 from memory_gym_envs.base import ALL, DEBUG_ZOOM, MemoryGymVectorEnv
+from memory_gym_envs.bits import (
+    ITEMS,
+    LINE,
+    NOTHING,
+    PLACE_0,
+    PLACES,
+    STEP,
+    Stencils,
+    pixel_scratch,
+    pixels,
+    sample,
+    samples,
+    stencils,
+    sums,
+    tile_counts,
+    unpacked,
+)
 from memory_gym_envs.character import (
     FACINGS,
     PAD,
@@ -21,11 +38,12 @@ from memory_gym_envs.character import (
     free_controls,
     hand_places,
     radius_of,
+    sprites,
     walk,
     wardrobe,
 )
 from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, disk, magnify, make_sheet, paste, ring
-from memory_gym_envs.entries import Entries
+from memory_gym_envs.entries import Entries, vector_slices
 from memory_gym_envs.options import Option
 
 TILE = 12  # pixels; the floor is a chessboard
@@ -39,7 +57,7 @@ MOST_COINS = 20
 MOST_SPOTS = 200  # slow spotlights stay for ever, so others may come ever faster than they leave
 
 AGENT, EXIT, COIN = 0, 1, 2  # bodies; coins are the last ones
-GONE = 1000  # where bodies are that do not exist, in pixels
+GONE = 180  # where bodies are that do not exist, in pixels: too far away to be touched or seen
 AWAY = -1000  # where spotlights are that do not exist
 
 # What is known of a spotlight, a row of State.spots. Its place at time t is START + t * (TOWARD + t * BEND).
@@ -48,7 +66,6 @@ TIME, SPEED, RADIUS, REACH, SIGHT = range(5)
 START, TOWARD, BEND = slice(5, 7), slice(7, 9), slice(9, 11)
 NO_SPOT = np.array([0.0, 0.0, 0.0, -1.0, -1.0, AWAY, AWAY, 0.0, 0.0, 0.0, 0.0])  # (11,)
 
-PLACES, PLACE_0 = 256, 64  # spotlights are at -64 .. 191 on both axes
 NO_KEY = -AWAY  # brings a spotlight that does not exist to place 0
 
 NO_LIMIT = np.iinfo(np.int64).max
@@ -64,7 +81,7 @@ class Variant:
     endless: bool  # one coin after the other, no exit
     render_fps: int
     options: tuple[Option, ...]
-    entries: tuple[Entries, ...] = ()  # of a vector observation
+    entries: tuple[Entries, ...]  # of a vector observation
 
 
 UNUSED = "ignored, as in the original"
@@ -129,9 +146,32 @@ def _body_rows(endless: bool) -> list[tuple[bool, Option]]:
     ]
 
 
+def _entries(endless: bool) -> tuple[Entries, ...]:
+    """What the vector of an id holds."""
+    action = "the action in the bar, one-hot: none, {}, {}; zeros where it is hidden"
+    place = "{}: pixels that are visible, over 144 and at most 1; x and y of their middle, over 84"
+    tiles = "of each tile of 12 x 12 pixels, row by row, the share that is {}; the bar's pixels don't count"
+    table = [
+        (True, "health", 1, "share of the bar's left half that is green"),
+        (True, "horizontal", 3, action.format("left", "right")),
+        (True, "vertical", 3, action.format("up", "down")),
+        (True, "rewarded", 1, "1 where the bar shows a positive reward"),
+        (True, "agent", 3, place.format("the agent")),
+        (not endless, "exit", 3, place.format("the exit without its black frame")),
+        (True, "coin", 3, place.format("the coin, or all of them")),
+        (True, "facing", 8, "the agent's where all of it is visible, one-hot: up, up-left, left, ... up-right"),
+        (not endless, "exit_open", 1, "1 where an open exit is visible"),
+        (not endless, "coins", 49, tiles.format("coins")),
+        (True, "light", 49, tiles.format("bright floor or, with a black background, rims of spotlights")),
+        (True, "dusk", 1, "brightness of the floor outside of the light, while any is visible"),
+        (True, "alarm", 1, "1 where red floor is visible"),
+    ]
+    return tuple(Entries(*row) for present, *row in table if present)
+
+
 VARIANTS = {
-    "SearingSpotlights-v0": Variant(False, 25, _options(endless=False)),
-    "Endless-SearingSpotlights-v0": Variant(True, 25, _options(endless=True)),
+    "SearingSpotlights-v0": Variant(False, 25, _options(endless=False), _entries(endless=False)),
+    "Endless-SearingSpotlights-v0": Variant(True, 25, _options(endless=True), _entries(endless=True)),
 }
 
 
@@ -184,6 +224,7 @@ class State:
     rim: np.ndarray  # (N,) bool: spotlights have a white rim
     darkness: np.ndarray  # (N, FADE) uint8: opacity of the dark after so many steps
     dark_at: np.ndarray  # (N,) steps until it is opaque and nothing else
+    reddens: np.ndarray  # (N,) 1 if the floor is red while the agent is in the light
     senses: np.ndarray  # (N,) the first row of bars() that shows what the lane may see
     exit_layer: np.ndarray  # (N,) UNDER the dark, or above it and BELOW_BAR or ABOVE_BAR
     agent_layer: np.ndarray  # (N,) likewise
@@ -407,11 +448,6 @@ GREY = (50, 50, 50)
 ACTION_COLORS = ((120, 120, 120), (116, 1, 113), (255, 94, 14))  # nothing, left or up, right or down
 BLUE_FLOOR, RED_FLOOR, WHITE_FLOOR, BLACK_FLOOR = range(4)
 
-# Which pixels are lit is kept as bits: an item of 14 pixels, 6 items a row, 504 a frame.
-ITEM = 14
-ITEMS = SCREEN // ITEM
-BITS = 1 << np.arange(ITEM, dtype=np.uint16)
-
 
 @cache
 def floors() -> np.ndarray:
@@ -454,67 +490,32 @@ def bars(endless: bool) -> np.ndarray:
 
 
 class Lamps(NamedTuple):
-    """Every spotlight at every place as bits, ready to be laid over each other.
+    """Every spotlight at every place, by its radius."""
 
-    A picture is a window of 84 rows on a long tape, on which each disk stands between 84 dark rows, once for every x.
-    """
-
-    column: np.ndarray  # (radii * PLACES,) where on the tape the disk starts, for every radius and x
-    row: np.ndarray  # (radii * PLACES,) how far from there the window starts, for every radius and y
-    disks: np.ndarray  # (rows,) windows that start at each row of the tape, as one item each
-    rims: np.ndarray  # (rows,) likewise, the disks' outlines
+    disks: Stencils
+    rims: Stencils  # their outlines
 
 
 @lru_cache(maxsize=8)
 def lamps(least: int, largest: int) -> Lamps:
     """The tables for spotlights of these radii. Cached: environments with the same options share them."""
-    column = np.full((largest + 1, PLACES), SCREEN)  # the tape begins with a window that stays dark whatever the row
-    row = np.zeros((largest + 1, PLACES), np.int64)
-    tapes = [[np.zeros((4 * SCREEN, ITEMS), np.uint16)] for _ in range(2)]
-    places, end = np.arange(PLACES) - PLACE_0, 4 * SCREEN
-    for radius in range(least, largest + 1):
-        width = 2 * radius
-        seen = (places > -radius) & (places < SCREEN + radius)
-        column[radius, seen] = end + (width + SCREEN) * (places[seen] + radius - 1)
-        row[radius] = (radius - places).clip(-SCREEN, width)
-        tapes[0].append(_tape(disk(width, radius, radius, radius)))
-        tapes[1].append(_tape(ring(width, radius, radius, radius, 1)))
-        end += len(tapes[0][-1])
-    return Lamps(column.reshape(-1), row.reshape(-1), *(_windows(np.concatenate(tape)) for tape in tapes))
+    disks, rims = spot_shapes(least, largest)
+    return Lamps(stencils(disks), stencils(rims))
 
 
-def _tape(shape: np.ndarray) -> np.ndarray:
-    """(rows, ITEMS) uint16: a (W, W) mask at every x where any of it is on the screen, each before 84 dark rows."""
-    wide = np.pad(shape, ((0, 0), (SCREEN - 1, SCREEN - 1)))
-    cut = np.lib.stride_tricks.sliding_window_view(wide, SCREEN, axis=1)[:, ::-1]  # (W, X, 84), from left to right
-    bits = cut.reshape(*cut.shape[:2], ITEMS, ITEM) @ BITS  # (W, X, ITEMS)
-    return np.pad(bits.transpose(1, 0, 2), ((0, 0), (0, SCREEN), (0, 0))).reshape(-1, ITEMS)
+def spot_shapes(least: int, largest: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The masks of spotlights by radius, and their outlines."""
+    radii = range(least, largest + 1)
+    disks = [disk(2 * radius, radius, radius, radius) for radius in radii]
+    rims = [ring(2 * radius, radius, radius, radius, 1) for radius in radii]
+    return [NOTHING] * least + disks, [NOTHING] * least + rims
 
 
-def _windows(tape: np.ndarray) -> np.ndarray:
-    """Every window of 84 rows, by its first row: one item each, a view."""
-    window = np.dtype(f"V{2 * ITEMS * SCREEN}")
-    return np.ndarray((len(tape) - SCREEN + 1,), window, tape, 0, (2 * ITEMS,))
+def draw_props(scales: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Coins and exits of the given pairs of scales, a coin, a closed exit and an open one for each.
 
-
-@cache
-def _pixels() -> np.ndarray:
-    """(2**ITEM,) items of 42 bytes: 255 where a bit is set."""
-    bits = (np.arange(1 << ITEM)[:, None] >> np.arange(ITEM)) & 1
-    return (bits.astype(np.uint8) * np.uint8(255)).repeat(3, axis=1).view(f"V{3 * ITEM}")[:, 0]
-
-
-def pixels(bits: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-    """Bits of frames, (n, 504) uint16, as a mask for frames: (n, FRAME) uint8, 255 where set.
-
-    out: (n, 504) items of 42 bytes to write it to, which costs less than fresh memory.
+    Their colours (R, W, W, 3), and (R, W, W) bool what is drawn of them.
     """
-    return _pixels().take(bits, out=out, mode="clip").view(np.uint8)
-
-
-@lru_cache(maxsize=16)
-def props(scales: tuple[tuple[float, float], ...]) -> Sheet:
-    """The sprites of coins and exits of the given pairs of scales: a coin, a closed exit and an open one for each."""
     width = 2 * max(int(10 * scale) for pair in scales for scale in pair) + 2
     images = np.zeros((3 * len(scales), width, width, 3), np.uint8)
     solids = np.zeros(images.shape[:3], bool)
@@ -522,7 +523,13 @@ def props(scales: tuple[tuple[float, float], ...]) -> Sheet:
         _draw_coin(images[3 * index], solids[3 * index], coin_scale)
         for look, color in enumerate((DOOR_CLOSED, DOOR_OPEN)):
             _draw_exit(images[3 * index + 1 + look], solids[3 * index + 1 + look], exit_scale, color)
-    return make_sheet(images, solids, np.arange(SCREEN))
+    return images, solids
+
+
+@lru_cache(maxsize=16)
+def props(scales: tuple[tuple[float, float], ...]) -> Sheet:
+    """The sprites of these coins and exits."""
+    return make_sheet(*draw_props(scales), np.arange(SCREEN))
 
 
 def _draw_coin(image: np.ndarray, solid: np.ndarray, scale: float) -> None:
@@ -565,7 +572,7 @@ class Art(NamedTuple):
     figures: Sheet
     props: Sheet
     bars: np.ndarray
-    mask: np.ndarray  # (N, 504) scratch for pixels()
+    scratch: np.ndarray  # (N, 588) scratch for pixels()
 
 
 def draw(s: State, art: Art, lanes: np.ndarray | slice) -> np.ndarray:
@@ -573,18 +580,22 @@ def draw(s: State, art: Art, lanes: np.ndarray | slice) -> np.ndarray:
     dim = (s.length < s.dark_at)[lanes]  # (n,) the darkness is not just black
     frames = scene(s, art, lanes, s.seen[lanes] | dim)
     lit, rim = shine(s, art.lamps, lanes)
-    darken(s, lanes, frames, pixels(lit, art.mask[: len(lit)]), rim, np.flatnonzero(dim))
+    darken(s, lanes, frames, pixels(lit, art.scratch[: len(lit)]), rim, np.flatnonzero(dim))
     coins = s.coin_age[lanes] < s.coin_show[lanes]
     if np.count_nonzero(coins):
         put_coins(s, art, lanes, frames, coins)
     layered = np.count_nonzero(s.layered[lanes])
     if layered:
         put_layer(s, art, lanes, frames, BELOW_BAR)
-    senses = s.senses[lanes] + (3 * s.shown_action[lanes] + s.shown_gain[lanes]) * WIDTHS + s.red[lanes]
-    frames.reshape(-1, SCREEN, ROW)[:, :BAR] = art.bars.take(senses, axis=0)[:, None]
+    frames.reshape(-1, SCREEN, ROW)[:, :BAR] = art.bars.take(bar_rows(s, lanes), axis=0)[:, None]
     if layered:
         put_layer(s, art, lanes, frames, ABOVE_BAR)
     return frames.reshape(-1, SCREEN, SCREEN, 3)
+
+
+def bar_rows(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+    """(n,) which of bars() the lanes show."""
+    return s.senses[lanes] + (3 * s.shown_action[lanes] + s.shown_gain[lanes]) * WIDTHS + s.red[lanes]
 
 
 def scene(s: State, art: Art, lanes: np.ndarray | slice, seen: np.ndarray | bool) -> np.ndarray:
@@ -639,24 +650,27 @@ def put_layer(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray,
 
 
 def shine(s: State, tables: Lamps, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
-    """What the spotlights light and, if any has a rim, which pixels those are: bits, (n, 504) uint16."""
-    across, down = s.place[:, lanes]
-    start = (tables.column.take(across) + tables.row.take(down)).T.copy()  # (S, n)
-    lit = np.bitwise_or.reduce(_words(tables.disks[start]), axis=0).view(np.uint16)
-    if not np.count_nonzero(s.rim[lanes]):
+    """What the spotlights light and, if any has a rim, which pixels those are: masks, (n, 588) uint16."""
+    x, y = s.place[:, lanes].transpose(0, 2, 1)  # (S, n)
+    lit, rim = overlay(tables.disks.at(x, y), tables.rims, x, y, s.rim[lanes])
+    return lit.view(np.uint16), None if rim is None else rim.view(np.uint16)
+
+
+def overlay(
+    disks: np.ndarray, rims: Stencils, x: np.ndarray, y: np.ndarray, rimmed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Lays spotlights over each other: what they light and, if any has a rim, which pixels those are, (n, words).
+
+    disks: (S, n, words) each alone. rims, x, y: the table with their rims, and its keys (S, n). rimmed: (n,) bool.
+    """
+    lit = np.bitwise_or.reduce(disks, axis=0)
+    if not np.count_nonzero(rimmed):
         return lit, None
     # A later spotlight covers the rims of the earlier ones, and its own rim covers their light.
-    inner, rim = np.zeros((2, start.shape[1], ITEMS * SCREEN), np.uint16)
-    for spot in start:  # (n,)
-        disk_, own = (_words(table[spot]).view(np.uint16) for table in (tables.disks, tables.rims))
-        inner, rim = (inner | disk_) & ~own, (rim & ~disk_) | own
-    rimmed = s.rim[lanes][:, None]
-    return np.where(rimmed, inner, lit), rim * rimmed
-
-
-def _words(windows: np.ndarray) -> np.ndarray:
-    """Windows of a tape as (..., 126) uint64."""
-    return windows.view(np.uint64).reshape(*windows.shape, -1)
+    inner, rim = np.zeros((2, *lit.shape), np.uint64)
+    for own_disk, own_rim in zip(disks, rims.at(x, y), strict=True):
+        inner, rim = (inner | own_disk) & ~own_rim, (rim & ~own_disk) | own_rim
+    return np.where(rimmed[:, None], inner, lit), rim * rimmed[:, None]
 
 
 def darken(
@@ -669,7 +683,7 @@ def darken(
 ) -> None:
     """Lays the darkness over the lanes' frames, (n, FRAME), in place.
 
-    lit: (n, FRAME) mask of what it leaves out. rim: (n, 504) bits of it that are white, or None.
+    lit: (n, FRAME) mask of what it leaves out. rim: (n, 588) mask of what of it is white, or None.
     dim: those of the n lanes where it is not just black.
     """
     if dim.size:
@@ -687,6 +701,193 @@ def darken(
     frames &= lit
     if dim.size:
         frames[dim] |= veiled
+
+
+# ---- vectors ----
+
+# All that a vector says of what is below the bar comes from every third pixel, by its colour.
+FAINT = 252  # the darkest dark in which an agent, (3, 3, 2) there, still differs from white floor
+SLIGHT = 5  # and the darkest one in which some colours may stay as they are
+FIRST_RIM = 51  # from there on a rim differs from all colours that it runs over, if only by 1
+LINES_BELOW = np.where(np.arange(0, SCREEN, STEP) < BAR, 0, LINE).astype(np.uint64)  # (42,) the sample below the bar
+TILE_SAMPLES = tile_counts(LINES_BELOW[None])[0].astype(np.float32)  # (49,)
+BLUE_LINES = sample((floors()[BLUE_FLOOR].reshape(SCREEN, SCREEN, 3) == BLUE).all(axis=-1))  # (42,) or red ones
+NO_BITS = np.uint64(0)
+READING = slice(0, 8)  # the entries that come from the bar
+# By opacity, (256,): all bits where the darkness hides nothing, and where it is as good as none; what dims the floor.
+OPEN, BRIGHT = ((np.arange(256) <= limit) * LINE for limit in (FAINT, SLIGHT))
+DUSK = (1 - np.arange(256) / 255) * (OPEN > BRIGHT)
+
+
+@cache
+def readings(endless: bool) -> np.ndarray:
+    """(4 * SENSES, 8) float32, read-only: what each of bars() says."""
+    table = read_bars(bars(endless).reshape(-1, SCREEN, 3))
+    table.flags.writeable = False
+    return table
+
+
+def read_bars(bar: np.ndarray) -> np.ndarray:
+    """Health, horizontal and vertical action, reward: (n, 84, 3) uint8 -> (n, 8) float32."""
+    half, quarter = SCREEN // 2, SCREEN // 4
+    green, yellow, *actions = ((bar == color).all(axis=-1) for color in (GREEN, YELLOW, *ACTION_COLORS))  # (n, 84)
+    across = [where[:, half : half + quarter].any(axis=1) for where in actions]
+    down = [where[:, half + quarter :].any(axis=1) for where in actions]
+    entries = [green[:, :half].mean(axis=1), *across, *down, yellow[:, half:].any(axis=1)]
+    return np.stack(entries, axis=1).astype(np.float32)
+
+
+class Gauges(NamedTuple):
+    """The tables that vectors are made of. Bodies are the agent, the exit (not in the endless id) and the coins."""
+
+    at: dict[str, slice]  # where the entries are in the vector
+    bars: np.ndarray
+    readings: np.ndarray
+    shapes: (
+        Stencils  # samples of spotlights by radius, figures in all facings, and a coin, an exit, a door for each scale
+    )
+    rims: Stencils  # samples of spotlights' outlines
+    high: Stencils  # masks of the bar's rows with the same shapes
+    key: np.ndarray  # (K + 1, N) where the lanes' bodies are in those tables, and then the exit's door
+    bodies: np.ndarray  # (K + 1,) their numbers in State.bodies. Without exits there is no door: both are (K, ...) then
+    coin: int  # which of the bodies is the first coin
+    handed: np.ndarray  # (N,) bool: the agent has hands, which show its facing
+
+
+@lru_cache(maxsize=16)
+def gauge_shapes(
+    least: int, largest: int, figure_scales: tuple[float, ...], scales: tuple[tuple[float, float], ...]
+) -> tuple[Stencils, Stencils, Stencils]:
+    """Gauges' shapes, rims and high. Cached: environments with equal options share them."""
+    disks, rims = spot_shapes(least, largest)
+    figures = [solid for scale in figure_scales for solid in sprites(scale)[1]]
+    images, solids = draw_props(scales)
+    # An exit's frame is as black as the dark, so what can be seen of it is its door.
+    things = [each for i in range(0, len(solids), 3) for each in (*solids[i : i + 2], images[i + 1].any(axis=-1))]
+    shapes = disks + figures + things
+    return samples(shapes), samples(rims), stencils(shapes, BAR)
+
+
+class Scene(NamedTuple):
+    """n lanes' frames as samples, (n, 42) uint64 each, and the K bodies in them."""
+
+    lit: np.ndarray  # what the darkness leaves out, below the bar
+    clear: np.ndarray  # what it does not hide there
+    rim: np.ndarray | None  # what of the light is white, if any lane has rims
+    x: np.ndarray  # (K, n) where the bodies are, as keys of the gauges
+    y: np.ndarray  # (K, n)
+    layer: np.ndarray | None  # (K, n, 1) UNDER the darkness, BELOW_BAR or ABOVE_BAR; None if all are under it
+    cover: np.ndarray  # (K, n, 42) what each body covers
+    seen: np.ndarray  # (K, n, 42) what is visible of it
+
+
+def describe(s: State, g: Gauges, lanes: np.ndarray | slice) -> np.ndarray:
+    """The vectors of the lanes, (n, V) float32, from the state alone. No frame is drawn.
+
+    They are made of the colours of the bar and of every third pixel below it, so that equal frames have equal vectors.
+    """
+    opacity = s.darkness[np.arange(len(s.pos))[lanes], np.minimum(s.length[lanes], FADE - 1)]
+    out = np.zeros((len(opacity), max(each.stop for each in g.at.values())), np.float32)
+    scene = survey(s, g, lanes, opacity)
+    describe_bar(s, g, lanes, scene, out)
+    describe_bodies(s, g, lanes, scene, out)
+    describe_floor(s, g, lanes, scene, opacity, out)
+    return out
+
+
+def survey(s: State, g: Gauges, lanes: np.ndarray | slice, opacity: np.ndarray) -> Scene:
+    """The lanes' frames as samples. opacity: (n,) of their darkness."""
+    place, key = s.place[:, lanes], g.key[:, lanes].T.copy()  # (2, n, S), (n, K + 1)
+    key[:, AGENT] += s.look[lanes] * PLACES
+    places = np.concatenate([place, s.bodies[:, lanes].take(g.bodies, axis=2) + key], axis=2)
+    x, y = places.transpose(0, 2, 1)  # (S + K + 1, n)
+    shapes, spots = g.shapes.at(x, y), place.shape[2]  # (S + K + 1, n, 42)
+    lit, rim = overlay(shapes[:spots], g.rims, x[:spots], y[:spots], s.rim[lanes])
+    lit |= BRIGHT.take(opacity)[:, None]
+    lit &= LINES_BELOW
+    clear = lit | OPEN.take(opacity)[:, None] & LINES_BELOW
+    has_exit = g.coin == COIN
+    bodies = slice(spots, -1) if has_exit else slice(spots, None)
+    cover, layer = shapes[bodies], layers(s, g, lanes)
+    if layer is None:
+        seen = cover & clear & ~behind(cover)
+    else:
+        raised = np.where(layer == UNDER, NO_BITS, cover)
+        front = np.bitwise_or.reduce(raised, axis=0)
+        hidden = np.where(layer == UNDER, behind(cover ^ raised) | front, behind(raised))
+        seen = cover & ~hidden & np.where(layer == UNDER, clear, np.where(layer == BELOW_BAR, LINES_BELOW, LINE))
+    if has_exit:
+        seen[EXIT] &= shapes[-1]
+    return Scene(lit, clear, rim, x[bodies], y[bodies], layer, cover, seen)
+
+
+def layers(s: State, g: Gauges, lanes: np.ndarray | slice) -> np.ndarray | None:
+    """Scene's layer."""
+    coins = s.coin_age[lanes] < s.coin_show[lanes]
+    if not np.count_nonzero(coins) and not np.count_nonzero(s.layered[lanes]):
+        return None
+    others = [s.agent_layer[lanes], s.exit_layer[lanes]][: g.coin]
+    return np.stack(others + [coins * BELOW_BAR] * (s.bodies.shape[2] - COIN))[..., None]
+
+
+def behind(cover: np.ndarray) -> np.ndarray:
+    """What others hide of bodies that cover this, (K, n, 42), if the first of them is in front and the last behind."""
+    hidden = np.zeros_like(cover)
+    np.bitwise_or.accumulate(cover[:-1], axis=0, out=hidden[1:])
+    return hidden
+
+
+def describe_bar(s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, out: np.ndarray) -> None:
+    """Writes health, action and reward."""
+    senses = bar_rows(s, lanes)
+    out[:, READING] = g.readings.take(senses, axis=0)
+    if scene.layer is not None:
+        over_bar = scene.layer == ABOVE_BAR  # (K, n, 1)
+        (high,) = over_bar.any(axis=(0, 2)).nonzero()
+        cover = g.high.at(scene.x[:, high], scene.y[:, high]) * over_bar[:, high]  # (K, m, words)
+        left = ~np.bitwise_or.reduce(cover, axis=0).view(np.uint16).reshape(-1, BAR, ITEMS)
+        columns = unpacked(np.bitwise_or.reduce(left, axis=1))  # (m, 84) those of which anything is left
+        out[high, READING] = read_bars(g.bars[senses[high]].reshape(-1, SCREEN, 3) * columns[..., None])
+
+
+def describe_bodies(s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, out: np.ndarray) -> None:
+    """Writes how much is visible of the agent, the exit and the coins, where that is and what it shows."""
+    body, lane = np.bitwise_or.reduce(scene.seen, axis=2).nonzero()
+    total = np.zeros((len(out), len(scene.x), 3), np.float32)  # (n, K, 3) pixels, sums of their x and y
+    total[lane, body] = sums(scene.seen[body, lane])
+    if len(scene.x) > g.coin + 1:
+        total[:, g.coin] = total[:, g.coin :].sum(axis=1)
+    total = total[:, : g.coin + 1]
+    places = out[:, g.at["agent"].start : g.at["coin"].stop].reshape(total.shape)
+    places[..., 1:] = total[..., 1:] / np.maximum(SCREEN * total[..., :1], 1)
+    places[..., 0] = np.minimum(total[..., 0] / TILE_SAMPLES.max(), 1)
+    hidden = np.bitwise_or.reduce(scene.cover[AGENT] & LINES_BELOW & ~scene.seen[AGENT], axis=1)
+    (told,) = ((hidden == 0) & (total[:, AGENT, 0] > 0) & g.handed[lanes]).nonzero()
+    out[told, g.at["facing"].start + s.look[lanes][told]] = 1
+    if "exit" in g.at:
+        out[:, g.at["exit_open"].start] = s.is_open[lanes] * (total[:, EXIT, 0] > 0)
+
+
+def describe_floor(
+    s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, opacity: np.ndarray, out: np.ndarray
+) -> None:
+    """Writes the tiles' coins and light, and what else the floor shows."""
+    floor = ~np.bitwise_or.reduce(scene.cover, axis=0)  # (n, 42)
+    bright, visible = scene.lit & floor, scene.clear & floor
+    dusk, red = DUSK.take(opacity), (s.floor & s.reddens)[lanes]
+    if scene.rim is not None:
+        rim = scene.rim & LINES_BELOW * (opacity >= FIRST_RIM)[:, None]
+        if scene.layer is not None:
+            rim &= ~np.bitwise_or.reduce(np.where(scene.layer == UNDER, NO_BITS, scene.cover), axis=0)
+        rimmed = s.rim[lanes]
+        bright = np.where(rimmed[:, None], rim, bright)
+        dusk = dusk * ~rimmed
+    if "exit" in g.at:
+        coins = np.bitwise_or.reduce(scene.seen[g.coin :], axis=0)
+        out[:, g.at["coins"]] = tile_counts(coins) / TILE_SAMPLES
+    out[:, g.at["light"]] = tile_counts(bright) / TILE_SAMPLES
+    out[:, g.at["dusk"].start] = dusk * (visible != bright).any(axis=1)
+    out[:, g.at["alarm"].start] = red * (visible & BLUE_LINES).any(axis=1)
 
 
 # ---- rules ----
@@ -795,7 +996,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
     """
 
     variants = VARIANTS
-    tables = ("_wardrobe", "_art")
+    tables = ("_wardrobe", "_art", "_gauges")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
         """The observation space of one lane with pixels, and its action space."""
@@ -811,7 +1012,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
     def configure(self, lanes: np.ndarray) -> None:
         """Takes over the options of the lanes, and the tables that all lanes' options need."""
         s, endless, values = self.state, self.variant.endless, self.settings[int(lanes[0])]
-        make_room(s, coins=1 if endless else max(values["num_coins"], default=0))
+        make_room(s, coins=1 if endless else max((1, *values["num_coins"])))
         for field, name in RULES.items():
             getattr(s, field)[lanes] = values.get(name, 0)
         s.limit[lanes] = _limit(values["max_steps"])
@@ -837,6 +1038,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         # A rim is drawn like dimmed pixels are, so with rims the darkness is never just black.
         opaque = np.flatnonzero(fading == 255)
         s.dark_at[lanes] = opaque[0] if opaque.size and not values["black_background"] else NO_LIMIT
+        s.reddens[lanes] = s.floors[lanes[0], 1] == RED_FLOOR
         shown = values["show_last_action"] + 2 * values["show_last_positive_reward"]
         s.senses[lanes] = shown * SENSES
         exit_, coins = values.get("exit_visible", False), values["coins_visible"]
@@ -857,12 +1059,37 @@ class SearingSpotlights(MemoryGymVectorEnv):
         """The tables that step() looks things up in, and where each lane's rows start in them."""
         self._wardrobe = wardrobe(tuple(figure for pair in self.figures for figure in pair))
         radii = [values[name] for values in self.settings for name in ("spot_min_radius", "spot_max_radius")]
-        spots = lamps(int(min(radii)), int(max(radii)))
-        mask = np.empty((self.num_envs, ITEMS * SCREEN), _pixels().dtype)
-        self._art = Art(spots, self._wardrobe.sheet, props(self.scales), bars(self.variant.endless), mask)
+        radii, endless = (int(min(radii)), int(max(radii))), self.variant.endless
+        scratch = pixel_scratch(self.num_envs)
+        self._art = Art(lamps(*radii), self._wardrobe.sheet, props(self.scales), bars(endless), scratch)
+        if self.obs_type == "vector":
+            self._gauges = self._make_gauges(*radii)
         self._controls = free_controls()
         self._calm = np.arange(0, 2 * self.num_envs, 2)  # (N,) the scenery's calm rows
         self._lane_walk = (self.state.figure[:, None] + np.arange(2)) * (STRIDES * SPAN)  # (N, 2)
+
+    def _make_gauges(self, least: int, largest: int) -> Gauges:
+        """The tables that vectors are made of, for spotlights of these radii."""
+        s, figures = self.state, tuple(across.scale for across, _ in self.figures)
+        coins = s.bodies.shape[2] - COIN
+        first = largest + 1 + len(figures) * FACINGS + s.props  # (N,) the coin, before the exit and the door
+        key = [largest + 1 + s.figure // 2 * FACINGS, first + 1, *[first] * coins, first + 2]
+        bodies = [AGENT, EXIT, *range(COIN, COIN + coins), EXIT]
+        if self.variant.endless:
+            key, bodies = key[:-1:COIN], bodies[:-1:COIN]
+        shapes, rims, high = gauge_shapes(least, largest, figures, self.scales)
+        return Gauges(
+            at=vector_slices(self.variant.entries),
+            bars=bars(self.variant.endless),
+            readings=readings(self.variant.endless),
+            shapes=shapes,
+            rims=rims,
+            high=high,
+            key=np.stack(key) * PLACES + PLACE_0,
+            bodies=np.array(bodies),
+            coin=1 if self.variant.endless else COIN,
+            handed=np.array([int(10 * values["agent_scale"]) > 0 for values in self.settings]),
+        )
 
     def begin(self, lane: int, rng: np.random.Generator) -> None:
         """Draws the lane's next level and starts its episode."""
@@ -870,7 +1097,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         spawns = NO_LIMIT if self.variant.endless else _limit(values["num_spawns"])
         level = draw_level(rng, values, self.variant)
         write_level(self.state, lane, level, spawns)
-        furnish(self.state, self._art, lane)
+        self._furnish(lane)
         if not level.coins:
             self._unlocked.append(lane)
 
@@ -882,7 +1109,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         while self._unlocked:
             lane = self._unlocked.pop()
             s.is_open[lane] = s.left[lane] == 0
-            furnish(s, self._art, lane)
+            self._furnish(lane)
         s.wait -= 1
         due = s.wait == 0
         if np.count_nonzero(due):
@@ -950,7 +1177,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
                 s.bodies[:, lane, COIN] = draw_coin(self._rngs[lane], last)
                 s.left[lane], s.coin_age[lane] = 1, 0
                 aim(s, lane)
-            furnish(s, self._art, lane)
+            self._furnish(lane)
 
     def _leave(self, touched: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
         """Ends the episodes whose agent stands at the open exit or, without one, has just taken the last coin."""
@@ -971,9 +1198,21 @@ class SearingSpotlights(MemoryGymVectorEnv):
         s.returned += rewards
         return (s.length == s.limit) & ~terminated
 
+    def _furnish(self, lane: int) -> None:
+        """Draws the lane's scenery anew, unless nothing but frames() needs it."""
+        if self.obs_type == "pixels":
+            furnish(self.state, self._art, lane)
+
     def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3)."""
+        if self.obs_type == "vector":
+            for lane in np.arange(self.num_envs)[lanes].tolist():
+                furnish(self.state, self._art, lane)
         return draw(self.state, self._art, lanes)
+
+    def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh vector observations of the lanes, (n, V) float32: see VARIANTS[id].entries."""
+        return describe(self.state, self._gauges, lanes)
 
     def ground_truth(self) -> np.ndarray:
         """A fresh (N, 6), or (N, 4) in the endless id: the agent's, the coin's and the exit's x and y, over 84."""

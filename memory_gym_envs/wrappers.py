@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from memory_gym_envs.base import ALL, one_of, overwrite
+from memory_gym_envs.bits import pixels
 from memory_gym_envs.drawing import FRAME, SCREEN
 from memory_gym_envs.options import resolve
 from memory_gym_envs.searing_spotlights import (
@@ -22,7 +23,6 @@ from memory_gym_envs.searing_spotlights import (
     VARIANTS,
     SearingSpotlights,
     lamps,
-    pixels,
     shine,
     spot_places,
 )

@@ -10,7 +10,6 @@ from players import player, stumbling, turn_or_walk
 from memory_gym_envs import MysteryPath
 from memory_gym_envs.character import BODY, PAD
 from memory_gym_envs.mystery_path import (
-    AGAIN,
     BEYOND,
     EAST,
     FIRST_SEGMENTS,
@@ -21,10 +20,9 @@ from memory_gym_envs.mystery_path import (
     SIDE,
     SOUTH,
     TILE,
-    WALL_WORDS,
     WEST,
-    Tape,
     draw_segments,
+    read_ahead,
     trail,
 )
 
@@ -64,7 +62,7 @@ def test_paths_lead_to_the_opposite_side(env_id, side):
         assert (path[0][axis], path[-1][axis]) == (near, SIDE - 1 - near)
         assert all(0 <= x < SIDE and 0 <= y < SIDE for x, y in path)
         check_path(s, path)
-        assert not any(s.walls[0, 0] >> (x * SIDE + y) & 1 for x, y in path)
+        assert not any(x * SIDE + y in s.walls[0][0] for x, y in path)
         ends.add((path[0], path[-1]))
         lengths.add(len(path))
     assert len(ends) > 20
@@ -97,7 +95,7 @@ def test_endless_paths_are_joined_by_transition_tiles():
 
 def further(rng, *arguments):
     """The endless path's next segments from this generator."""
-    tape = Tape(rng, FIRST_SEGMENTS)
+    tape = read_ahead(rng, FIRST_SEGMENTS)
     level = draw_segments(tape, *arguments)
     tape.close()
     return level
@@ -119,32 +117,6 @@ def test_endless_path_grows_when_its_last_segment_is_entered():
     assert s.segments[0] > 8
     assert s.cell[0, 1 : s.count[0] + 1].tolist() == level.path
     check_path(s, path_of(s))
-
-
-def test_tape_draws_what_the_generator_would():
-    for seed in range(20):
-        ahead, one_by_one = np.random.default_rng(seed), np.random.default_rng(seed)
-        if seed % 2:  # half of a 64-bit word is left over
-            ahead.integers(0, 7)
-            one_by_one.integers(0, 7)
-        tape = Tape(ahead, 4)
-        limits = [1, 2, 7, 8, 100, 2**31 + 1] * 30
-        drawn = []
-        for limit in limits:
-            drawn.append(tape.below(limit))
-        tape.close()
-        assert drawn == [one_by_one.integers(0, limit) for limit in limits]
-        assert ahead.bit_generator.state == one_by_one.bit_generator.state
-
-
-def test_tape_finds_the_words_that_are_drawn_again():
-    tape = Tape(np.random.default_rng(0), 1)
-    twin = Tape(np.random.default_rng(0), 1)
-    for word in (*AGAIN, WALL_WORDS - 1, WALL_WORDS, 0, 2**32 - 1):
-        for each in (tape, twin):
-            each.used, each.words[3] = 0, word
-        assert tape.chances(8) == [twin.below(100) < 33 for _ in range(8)]
-        assert tape.used == twin.used == 8 + (word in AGAIN)
 
 
 # ---- falling off ----
@@ -349,14 +321,14 @@ def test_past_path(camera):
         lanes = np.flatnonzero(s.tile[:, 0] > 0)
         if not lanes.size:
             continue
-        owner, cells = trail(s, lanes)
-        for index, lane in enumerate(lanes.tolist()):
+        owner, cells = trail(s, lanes, envs._lane_path)
+        for lane in lanes.tolist():
             expected, left = [], max(0, int(s.tile[lane, 0]) - 1 - int(camera))
             for step in range(int(s.at[lane]) - 1, 0, -1):
                 expected.append(int(s.cell[lane, step]))
                 if expected[-1] // ROWS <= left:
                     break
-            assert cells[owner == index].tolist() == expected
+            assert cells[owner == lane].tolist() == expected
             drawn, longest = drawn + len(expected), max(longest, len(expected))
     assert drawn > 300
     assert longest > camera + 1
@@ -394,8 +366,8 @@ def test_debug_render_shows_the_path(env_id):
         path = path_of(s)
         kinds = {place: BLUE if place[0] % SEGMENT == SIDE else WHITE for place in path}
         kinds |= {path[0]: BLUE} | ({} if endless else {path[-1]: GREEN})
-        for segment, walls in enumerate(s.walls[0, : s.segments[0]].tolist()):
-            places = [divmod(place, SIDE) for place in range(SIDE * SIDE) if walls >> place & 1]
+        for segment, walls in enumerate(s.walls[0]):
+            places = [divmod(place, SIDE) for place in walls]
             kinds |= {(column + SEGMENT * segment, row): RED for column, row in places}
         shown = 0
         for (column, row), color in kinds.items():

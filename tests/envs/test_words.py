@@ -1,19 +1,95 @@
-"""Integers made of a generator's words are those that the generator itself would draw."""
+"""Words of a bit generator make the numbers that NumPy's generator would draw, and leave it in the same state."""
 
 import numpy as np
 import pytest
+from numpy.random import MT19937, PCG64, PCG64DXSM, SFC64, Generator, Philox
 
-from memory_gym_envs.words import below, words
+from memory_gym_envs.words import LOW, PERCENT_AGAIN, Tape, below, words
+
+LIMITS = [2, 3, 7, 8, 49, 100, 2**31, 2**31 + 1, 2**32 - 1]  # one draw in two is repeated for a limit just above 2**31
+HALVES = pytest.mark.parametrize("kind", [PCG64, PCG64DXSM, SFC64, Philox])
 
 
-@pytest.mark.parametrize("kind", [np.random.PCG64, np.random.MT19937, np.random.Philox])
-def test_below_draws_what_the_generator_would(kind):
-    limits = [2, 4, 9, 36, 100, 2**31 + 1, 2**32 - 1] * 40  # of the largest, every other word is drawn again
-    for seed in range(10):
-        ours, theirs = (np.random.Generator(kind(seed)) for _ in range(2))
-        if seed % 2:  # half of a 64-bit word is left over
-            assert ours.integers(0, 7) == theirs.integers(0, 7)
-        word = words(ours)
-        assert [below(word, limit) for limit in limits] == [int(theirs.integers(0, limit)) for limit in limits]
-        assert ours.integers(0, 1 << 40) == theirs.integers(0, 1 << 40)
-        assert ours.integers(0, 7) == theirs.integers(0, 7)
+def twins(kind, seed):
+    """Two generators in the same state; with an odd seed, half of a 64-bit number is left over."""
+    pair = Generator(kind(seed)), Generator(kind(seed))
+    for rng in pair:
+        rng.integers(0, 7, 2 + seed % 2)
+    return pair
+
+
+def same_state(one, other):
+    return str(one.bit_generator.state) == str(other.bit_generator.state)
+
+
+@pytest.mark.parametrize("kind", [PCG64, SFC64, Philox, MT19937])
+def test_words_make_the_generators_numbers(kind):
+    for seed in range(4):
+        rng, twin = twins(kind, seed)
+        word = words(rng)
+        for limit in LIMITS * 20:
+            assert below(word, limit) == twin.integers(0, limit)
+        assert same_state(rng, twin)
+
+
+@HALVES
+@pytest.mark.parametrize("used", range(6))
+def test_a_tape_draws_the_used_words_only(kind, used):
+    for seed in range(4):
+        rng, twin = twins(kind, seed)
+        tape = Tape(rng, 9)
+        assert [tape() for _ in range(used)] == [twin.integers(0, 1 << 32) for _ in range(used)]
+        tape.close()
+        assert same_state(rng, twin)
+        assert rng.integers(0, 100) == twin.integers(0, 100)
+
+
+@HALVES
+def test_a_tape_makes_the_generators_numbers(kind):
+    for seed in range(4):
+        rng, twin = twins(kind, seed)
+        tape = Tape(rng, 2000)
+        for limit in LIMITS * 20:
+            assert tape.eighths[tape.used] == tape.words[tape.used] * 8 >> 32
+            assert below(tape, limit) == twin.integers(0, limit)
+        things = list(range(24))
+        assert tape.hits(things, 33) == [thing for thing in things if twin.integers(0, 100) < 33]
+        for count in (0, 1, 4, 23, 24, 25):
+            left, expected = things.copy(), things.copy()
+            picked = [expected.pop(twin.integers(0, len(expected))) for _ in range(min(count, len(things)))]
+            assert tape.picks(left, count) == picked
+        assert tape.picks([], 4) == []
+        tape.close()
+        assert same_state(rng, twin)
+
+
+def loaded(numbers):
+    """A tape of these words, and of some more that are never drawn again."""
+    tape = Tape(np.random.default_rng(0), 2)
+    tape.used = 0
+    tape.load(np.array(numbers + 9 * [12345], np.uint32).tobytes())
+    return tape
+
+
+@pytest.mark.parametrize("percent", [1, 33, 50, 99])
+def test_hits_at_the_edges_of_every_number(percent):
+    """Of a hundred words next to each other, which are the last ones of a number, and which are drawn again."""
+    edges = [-(-part * (1 << 32) // 100) for part in range(100)]
+    for edge in edges:
+        for word in ((edge - 1) & LOW, edge, edge + 1):
+            tape, one_by_one = loaded([5, word, 7]), loaded([5, word, 7])
+            assert tape.hits([10, 11, 12], percent) == [10 + i for i in range(3) if below(one_by_one, 100) < percent]
+            assert tape.used == one_by_one.used == 3 + (word in PERCENT_AGAIN)
+    assert len(PERCENT_AGAIN) == (1 << 32) % 100
+
+
+def test_picks_draw_again():
+    """Below six, words are drawn again of which six times as much leaves less than 2**32 % 6 = 4."""
+    tape = loaded([0, 1 << 31, (1 << 31) + 1])
+    assert tape.picks([0, 1, 2, 3, 4, 5], 1) == [3]
+    assert tape.used == 3
+
+
+def test_a_tape_needs_64_bit_numbers():
+    with pytest.raises(ValueError, match="MT19937"):
+        Tape(Generator(MT19937(0)), 4)
