@@ -16,6 +16,7 @@ from memory_gym_envs.base import ALL
 from memory_gym_envs.character import FACINGS, PAD
 from memory_gym_envs.entries import vector_slices, vector_space
 from memory_gym_envs.mortar_mayhem import COMMANDS, SYMBOL, SYMBOL_AT
+from memory_gym_envs.mystery_path import BEYOND, ROWS, SIDE
 
 VECTOR_IDS = [env_id for env_id in IDS if has(env_id, "vector")]
 EACH = pytest.mark.parametrize("env_id", VECTOR_IDS)
@@ -208,6 +209,22 @@ def test_crosses_over_agents(env_id, scale):
     red = (envs.frames(ALL) == (255, 0, 0)).all(axis=-1).any(axis=(1, 2))
     assert np.array_equal(cross, red)
     assert (frames < count) == (endless or (scale < 0.2 and "Grid" not in env_id))
+
+
+@pytest.mark.parametrize("scale", [0.25, 0.5, 1.0])
+def test_origins_behind_large_agents(scale):
+    columns, rows, x = combinations(np.arange(SIDE), np.arange(SIDE), [36, 42, 45])
+    cell = np.ones((len(x), SIDE * SIDE + 1), int)
+    cell[:, 1] = columns * ROWS + BEYOND + rows
+    state = {"pos": np.stack([x, x], axis=1) + PAD, "facing": np.zeros_like(x), "cell": cell}
+    envs, (count, frames, vectors, _) = look("MysteryPath-v0", {"agent_scale": scale, "show_origin": True}, **state)
+    origin = envs.vectors(ALL)[:, vector_slices(envs.variant.entries)["origin"]]
+    shown = origin.any(axis=1)
+    middle = np.stack([columns, rows], axis=1) * 12 + 6
+    assert np.allclose(origin[shown] * 84, middle[shown], atol=1e-4)
+    assert shown.all() == (scale < 0.5)
+    assert (frames < count) == (scale == 1.0)  # more than one at a time
+    assert vectors >= frames * 0.95
 
 
 # ---- what entries say ----
