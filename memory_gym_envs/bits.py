@@ -15,6 +15,7 @@ from memory_gym_envs.drawing import SCREEN
 
 ITEM = 12
 ITEMS = SCREEN // ITEM
+TILES = SCREEN // 12
 MASK = SCREEN * ITEMS  # items of a mask
 EVERY = (1 << ITEM) - 1  # all pixels of an item
 STEP = 2
@@ -134,9 +135,9 @@ def pixels(masks: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
 
 
 def tile_counts(lines: np.ndarray) -> np.ndarray:
-    """Bits of samples, (n, 42) uint64, in each tile of 12 x 12 pixels, at most 48: (n, 49) uint8, row by row."""
-    counts = np.bitwise_count(lines.view(np.uint8)).view(np.uint64).reshape(-1, ITEMS, LINES // ITEMS)
-    return np.einsum("njr->nj", counts).view(np.uint8).reshape(-1, ITEMS, 8)[..., :ITEMS].reshape(-1, ITEMS * ITEMS)
+    """Bits of samples, (n, 42) uint64, in each tile of 12 x 12 pixels, at most 48: (n, 7, 7) uint8."""
+    counts = np.bitwise_count(lines.view(np.uint8)).view(np.uint64).reshape(len(lines), TILES, -1)
+    return np.einsum("njr->nj", counts).view(np.uint8).reshape(len(lines), TILES, 8)[..., :TILES]
 
 
 _X, _Y = (ITEM * np.arange(ITEMS)[:, None] + SAMPLED).reshape(-1), STEP * np.arange(LINES)

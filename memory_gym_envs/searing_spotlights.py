@@ -15,10 +15,12 @@ from memory_gym_envs.base import ALL, DEBUG_ZOOM, MemoryGymVectorEnv
 from memory_gym_envs.bits import (
     ITEMS,
     LINE,
+    LINES,
     NOTHING,
     PLACE_0,
     PLACES,
     STEP,
+    TILES,
     Stencils,
     pixel_scratch,
     pixels,
@@ -651,24 +653,24 @@ def put_layer(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray,
 
 def shine(s: State, tables: Lamps, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
     """What the spotlights light and, if any has a rim, which pixels those are: masks, (n, 588) uint16."""
-    x, y = s.place[:, lanes].transpose(0, 2, 1)  # (S, n)
-    lit, rim = overlay(tables.disks.at(x, y), tables.rims, x, y, s.rim[lanes])
+    key = s.place[:, lanes, : int(s.count.max())].transpose(0, 2, 1).copy()  # (2, S, n)
+    lit, rim = overlay(tables.disks.at(*key), tables.rims, key, s.rim[lanes])
     return lit.view(np.uint16), None if rim is None else rim.view(np.uint16)
 
 
 def overlay(
-    disks: np.ndarray, rims: Stencils, x: np.ndarray, y: np.ndarray, rimmed: np.ndarray
+    disks: np.ndarray, rims: Stencils, key: np.ndarray, rimmed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Lays spotlights over each other: what they light and, if any has a rim, which pixels those are, (n, words).
 
-    disks: (S, n, words) each alone. rims, x, y: the table with their rims, and its keys (S, n). rimmed: (n,) bool.
+    disks: (S, n, words) each alone. rims, key: the table with their rims, and its keys (2, S, n). rimmed: (n,) bool.
     """
     lit = np.bitwise_or.reduce(disks, axis=0)
     if not np.count_nonzero(rimmed):
         return lit, None
     # A later spotlight covers the rims of the earlier ones, and its own rim covers their light.
     inner, rim = np.zeros((2, *lit.shape), np.uint64)
-    for own_disk, own_rim in zip(disks, rims.at(x, y), strict=True):
+    for own_disk, own_rim in zip(disks, rims.at(*key), strict=True):
         inner, rim = (inner | own_disk) & ~own_rim, (rim & ~own_disk) | own_rim
     return np.where(rimmed[:, None], inner, lit), rim * rimmed[:, None]
 
@@ -710,13 +712,14 @@ FAINT = 252  # the darkest dark in which an agent, (3, 3, 2) there, still differ
 SLIGHT = 5  # and the darkest one in which some colours may stay as they are
 FIRST_RIM = 51  # from there on a rim differs from all colours that it runs over, if only by 1
 LINES_BELOW = np.where(np.arange(0, SCREEN, STEP) < BAR, 0, LINE).astype(np.uint64)  # (42,) the sample below the bar
-TILE_SAMPLES = tile_counts(LINES_BELOW[None])[0].astype(np.float32)  # (49,)
+TILE_SHARE = 1 / tile_counts(LINES_BELOW[None]).astype(np.float32)  # (1, 7, 7)
 BLUE_LINES = sample((floors()[BLUE_FLOOR].reshape(SCREEN, SCREEN, 3) == BLUE).all(axis=-1))  # (42,) or red ones
 NO_BITS = np.uint64(0)
 READING = slice(0, 8)  # the entries that come from the bar
-# By opacity, (256,): all bits where the darkness hides nothing, and where it is as good as none; what dims the floor.
-OPEN, BRIGHT = ((np.arange(256) <= limit) * LINE for limit in (FAINT, SLIGHT))
-DUSK = (1 - np.arange(256) / 255) * (OPEN > BRIGHT)
+# By opacity: (256, 2) all bits where the darkness is as good as none, and where it hides nothing; and, where only the
+# latter is true, how bright the floor is, (256,).
+VEIL = (np.arange(256)[:, None] <= (SLIGHT, FAINT)) * LINE
+DUSK = ((1 - np.arange(256) / 255) * (VEIL[:, 1] > VEIL[:, 0])).astype(np.float32)
 
 
 @cache
@@ -740,7 +743,10 @@ def read_bars(bar: np.ndarray) -> np.ndarray:
 class Gauges(NamedTuple):
     """The tables that vectors are made of. Bodies are the agent, the exit (not in the endless id) and the coins."""
 
-    at: dict[str, slice]  # where the entries are in the vector
+    width: int  # of a vector
+    at: dict[str, slice]  # where its entries are
+    places: slice  # where those on the bodies' places are
+    tiles: slice  # where those on tiles are
     bars: np.ndarray
     readings: np.ndarray
     shapes: (
@@ -771,14 +777,16 @@ def gauge_shapes(
 class Scene(NamedTuple):
     """n lanes' frames as samples, (n, 42) uint64 each, and the K bodies in them."""
 
-    lit: np.ndarray  # what the darkness leaves out, below the bar
-    clear: np.ndarray  # what it does not hide there
+    opacity: np.ndarray  # (n,) of the darkness
+    lit: np.ndarray  # what it leaves out
+    clear: np.ndarray  # what it does not hide
     rim: np.ndarray | None  # what of the light is white, if any lane has rims
     x: np.ndarray  # (K, n) where the bodies are, as keys of the gauges
     y: np.ndarray  # (K, n)
-    layer: np.ndarray | None  # (K, n, 1) UNDER the darkness, BELOW_BAR or ABOVE_BAR; None if all are under it
+    layer: np.ndarray | None  # (K, n, 1) UNDER the darkness, BELOW_BAR or ABOVE_BAR; None: all are under it
     cover: np.ndarray  # (K, n, 42) what each body covers
     seen: np.ndarray  # (K, n, 42) what is visible of it
+    floor: np.ndarray  # what nothing covers
 
 
 def describe(s: State, g: Gauges, lanes: np.ndarray | slice) -> np.ndarray:
@@ -786,39 +794,33 @@ def describe(s: State, g: Gauges, lanes: np.ndarray | slice) -> np.ndarray:
 
     They are made of the colours of the bar and of every third pixel below it, so that equal frames have equal vectors.
     """
-    opacity = s.darkness[np.arange(len(s.pos))[lanes], np.minimum(s.length[lanes], FADE - 1)]
-    out = np.zeros((len(opacity), max(each.stop for each in g.at.values())), np.float32)
-    scene = survey(s, g, lanes, opacity)
+    scene = survey(s, g, lanes)
+    out = np.zeros((len(scene.lit), g.width), np.float32)
     describe_bar(s, g, lanes, scene, out)
-    describe_bodies(s, g, lanes, scene, out)
-    describe_floor(s, g, lanes, scene, opacity, out)
+    describe_rest(s, g, lanes, scene, out)
     return out
 
 
-def survey(s: State, g: Gauges, lanes: np.ndarray | slice, opacity: np.ndarray) -> Scene:
-    """The lanes' frames as samples. opacity: (n,) of their darkness."""
-    place, key = s.place[:, lanes], g.key[:, lanes].T.copy()  # (2, n, S), (n, K + 1)
-    key[:, AGENT] += s.look[lanes] * PLACES
-    places = np.concatenate([place, s.bodies[:, lanes].take(g.bodies, axis=2) + key], axis=2)
-    x, y = places.transpose(0, 2, 1)  # (S + K + 1, n)
-    shapes, spots = g.shapes.at(x, y), place.shape[2]  # (S + K + 1, n, 42)
-    lit, rim = overlay(shapes[:spots], g.rims, x[:spots], y[:spots], s.rim[lanes])
-    lit |= BRIGHT.take(opacity)[:, None]
-    lit &= LINES_BELOW
-    clear = lit | OPEN.take(opacity)[:, None] & LINES_BELOW
-    has_exit = g.coin == COIN
-    bodies = slice(spots, -1) if has_exit else slice(spots, None)
-    cover, layer = shapes[bodies], layers(s, g, lanes)
-    if layer is None:
-        seen = cover & clear & ~behind(cover)
-    else:
-        raised = np.where(layer == UNDER, NO_BITS, cover)
-        front = np.bitwise_or.reduce(raised, axis=0)
-        hidden = np.where(layer == UNDER, behind(cover ^ raised) | front, behind(raised))
-        seen = cover & ~hidden & np.where(layer == UNDER, clear, np.where(layer == BELOW_BAR, LINES_BELOW, LINE))
+def survey(s: State, g: Gauges, lanes: np.ndarray | slice) -> Scene:
+    """The lanes' frames as samples."""
+    place, each = s.place[:, lanes, : int(s.count.max())], np.arange(len(s.pos))[lanes]
+    spots, has_exit = place.shape[2], g.coin == COIN
+    key = np.empty((2, spots + len(g.key), len(each)), np.int64)
+    key[:, :spots] = place.transpose(0, 2, 1)
+    np.add(s.bodies[:, lanes].transpose(0, 2, 1)[:, g.bodies], g.key[:, lanes], out=key[:, spots:])
+    key[:, spots + AGENT] += s.look[lanes] * PLACES
+    shapes = g.shapes.at(*key)  # (S + K + 1, n, 42)
+    lit, rim = overlay(shapes[:spots], g.rims, key[:, :spots], s.rim[lanes])
+    opacity = s.darkness[each, np.minimum(s.length[lanes], FADE - 1)]
+    veil = VEIL.take(opacity, axis=0)  # (n, 2)
+    lit |= veil[:, :1]
+    clear = lit | veil[:, 1:]
+    bodies, layer = slice(spots, -1 if has_exit else None), layers(s, g, lanes)
+    cover = shapes[bodies]
+    seen, floor = uncover(cover, clear) if layer is None else uncover_layers(cover, clear, layer)
     if has_exit:
         seen[EXIT] &= shapes[-1]
-    return Scene(lit, clear, rim, x[bodies], y[bodies], layer, cover, seen)
+    return Scene(opacity, lit, clear, rim, *key[:, bodies], layer, cover, seen, floor)
 
 
 def layers(s: State, g: Gauges, lanes: np.ndarray | slice) -> np.ndarray | None:
@@ -830,11 +832,29 @@ def layers(s: State, g: Gauges, lanes: np.ndarray | slice) -> np.ndarray | None:
     return np.stack(others + [coins * BELOW_BAR] * (s.bodies.shape[2] - COIN))[..., None]
 
 
-def behind(cover: np.ndarray) -> np.ndarray:
-    """What others hide of bodies that cover this, (K, n, 42), if the first of them is in front and the last behind."""
-    hidden = np.zeros_like(cover)
-    np.bitwise_or.accumulate(cover[:-1], axis=0, out=hidden[1:])
-    return hidden
+def uncover(cover: np.ndarray, clear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What is visible of bodies and of the floor behind them, (K, n, 42) and (n, 42).
+
+    cover: (K, n, 42) what the bodies cover, from front to back. clear: (n, 42).
+    """
+    hidden = np.empty((len(cover) + 1, *clear.shape), np.uint64)
+    hidden[0], hidden[1:] = ~LINES_BELOW, cover
+    left = ~np.bitwise_or.accumulate(hidden, axis=0, out=hidden)
+    seen = left[:-1] & cover
+    seen &= clear
+    return seen, left[-1]
+
+
+def uncover_layers(cover: np.ndarray, clear: np.ndarray, layer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same where some of the bodies are above the darkness. layer: (K, n, 1)."""
+    above, below = np.where(layer == UNDER, NO_BITS, cover), np.where(layer == UNDER, cover, NO_BITS)
+    in_front = np.zeros((2, *cover.shape), np.uint64)
+    np.bitwise_or.accumulate(above[:-1], axis=0, out=in_front[0, 1:])
+    np.bitwise_or.accumulate(below[:-1], axis=0, out=in_front[1, 1:])
+    front = np.bitwise_or.reduce(above, axis=0)
+    bar = np.where(layer == ABOVE_BAR, LINE, LINES_BELOW)
+    seen = above & ~in_front[0] & bar | below & ~(in_front[1] | front) & LINES_BELOW & clear
+    return seen, LINES_BELOW & ~(front | np.bitwise_or.reduce(below, axis=0))
 
 
 def describe_bar(s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, out: np.ndarray) -> None:
@@ -850,44 +870,62 @@ def describe_bar(s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, o
         out[high, READING] = read_bars(g.bars[senses[high]].reshape(-1, SCREEN, 3) * columns[..., None])
 
 
-def describe_bodies(s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, out: np.ndarray) -> None:
-    """Writes how much is visible of the agent, the exit and the coins, where that is and what it shows."""
-    body, lane = np.bitwise_or.reduce(scene.seen, axis=2).nonzero()
-    total = np.zeros((len(out), len(scene.x), 3), np.float32)  # (n, K, 3) pixels, sums of their x and y
-    total[lane, body] = sums(scene.seen[body, lane])
-    if len(scene.x) > g.coin + 1:
-        total[:, g.coin] = total[:, g.coin :].sum(axis=1)
-    total = total[:, : g.coin + 1]
-    places = out[:, g.at["agent"].start : g.at["coin"].stop].reshape(total.shape)
-    places[..., 1:] = total[..., 1:] / np.maximum(SCREEN * total[..., :1], 1)
-    places[..., 0] = np.minimum(total[..., 0] / TILE_SAMPLES.max(), 1)
-    hidden = np.bitwise_or.reduce(scene.cover[AGENT] & LINES_BELOW & ~scene.seen[AGENT], axis=1)
-    (told,) = ((hidden == 0) & (total[:, AGENT, 0] > 0) & g.handed[lanes]).nonzero()
-    out[told, g.at["facing"].start + s.look[lanes][told]] = 1
-    if "exit" in g.at:
-        out[:, g.at["exit_open"].start] = s.is_open[lanes] * (total[:, EXIT, 0] > 0)
-
-
-def describe_floor(
-    s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, opacity: np.ndarray, out: np.ndarray
-) -> None:
-    """Writes the tiles' coins and light, and what else the floor shows."""
-    floor = ~np.bitwise_or.reduce(scene.cover, axis=0)  # (n, 42)
-    bright, visible = scene.lit & floor, scene.clear & floor
-    dusk, red = DUSK.take(opacity), (s.floor & s.reddens)[lanes]
+def describe_rest(s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, out: np.ndarray) -> None:
+    """Writes the other entries."""
+    cover, seen, (bodies, n, _) = scene.cover, scene.seen, scene.seen.shape
+    bright, visible, dusk = scene.lit & scene.floor, scene.clear & scene.floor, DUSK.take(scene.opacity)
     if scene.rim is not None:
-        rim = scene.rim & LINES_BELOW * (opacity >= FIRST_RIM)[:, None]
-        if scene.layer is not None:
-            rim &= ~np.bitwise_or.reduce(np.where(scene.layer == UNDER, NO_BITS, scene.cover), axis=0)
-        rimmed = s.rim[lanes]
-        bright = np.where(rimmed[:, None], rim, bright)
-        dusk = dusk * ~rimmed
+        bright = np.where(s.rim[lanes][:, None], rims_left(scene), bright)
+        dusk = dusk * ~s.rim[lanes]
+    lines = np.empty((bodies + 3, n, LINES), np.uint64)
+    lines[:bodies] = seen
+    np.bitwise_and(cover[AGENT] & LINES_BELOW, ~seen[AGENT], out=lines[bodies])
+    np.bitwise_xor(visible, bright, out=lines[bodies + 1])
+    np.bitwise_and(visible, BLUE_LINES, out=lines[bodies + 2])
+    any_ = np.bitwise_or.reduce(lines, axis=2) != 0  # (K + 3, n)
+    out[:, g.at["dusk"].start] = dusk * any_[-2]
+    out[:, g.at["alarm"].start] = (s.floor & s.reddens)[lanes] * any_[-1]
+    describe_places(g, seen, any_[:bodies], out)
+    (whole,) = (any_[AGENT] & ~any_[bodies] & g.handed[lanes]).nonzero()
+    out[whole, g.at["facing"].start + s.look[lanes][whole]] = 1
     if "exit" in g.at:
-        coins = np.bitwise_or.reduce(scene.seen[g.coin :], axis=0)
-        out[:, g.at["coins"]] = tile_counts(coins) / TILE_SAMPLES
-    out[:, g.at["light"]] = tile_counts(bright) / TILE_SAMPLES
-    out[:, g.at["dusk"].start] = dusk * (visible != bright).any(axis=1)
-    out[:, g.at["alarm"].start] = red * (visible & BLUE_LINES).any(axis=1)
+        out[:, g.at["exit_open"].start] = s.is_open[lanes] * any_[EXIT]
+    describe_tiles(g, seen, bright, out)
+
+
+def describe_places(g: Gauges, seen: np.ndarray, any_: np.ndarray, out: np.ndarray) -> None:
+    """Writes how much of the bodies is visible and where that is. any_: (K, n) whether any is."""
+    (bodies, n), kinds = any_.shape, g.coin + 1
+    body, lane = any_.nonzero()
+    total = sums(seen[body, lane])  # (hits, 3)
+    if bodies > kinds:
+        each = np.zeros((bodies, n, 3), np.float32)
+        each[body, lane] = total
+        each[g.coin] = each[g.coin :].sum(axis=0)
+        body, lane = each[:kinds, :, 0].nonzero()
+        total = each[body, lane]
+    total[:, 1:] /= SCREEN * total[:, :1]
+    np.minimum(total[:, 0] * TILE_SHARE.min(), 1, out=total[:, 0])
+    out[:, g.places].reshape(n, kinds, 3)[lane, body] = total
+
+
+def describe_tiles(g: Gauges, seen: np.ndarray, bright: np.ndarray, out: np.ndarray) -> None:
+    """Writes which share of each tile shows coins (not in the endless id) and light."""
+    kinds, n = g.coin, len(bright)
+    lines = np.empty((n, kinds, LINES), np.uint64)
+    if kinds > 1:
+        np.bitwise_or.reduce(seen[g.coin :], axis=0, out=lines[:, 0])
+    lines[:, -1] = bright
+    counts = tile_counts(lines.reshape(-1, LINES)).reshape(n, kinds, TILES, TILES)
+    np.multiply(counts, TILE_SHARE, out=out[:, g.tiles].reshape(counts.shape))
+
+
+def rims_left(scene: Scene) -> np.ndarray:
+    """What is visible of the rims, (n, 42): of any in a dark that is dark enough, and over all that is under it."""
+    rim = scene.rim & LINES_BELOW & -(scene.opacity >= FIRST_RIM)[:, None].astype(np.uint64)
+    if scene.layer is not None:
+        rim &= ~np.bitwise_or.reduce(np.where(scene.layer == UNDER, NO_BITS, scene.cover), axis=0)
+    return rim
 
 
 # ---- rules ----
@@ -1078,8 +1116,12 @@ class SearingSpotlights(MemoryGymVectorEnv):
         if self.variant.endless:
             key, bodies = key[:-1:COIN], bodies[:-1:COIN]
         shapes, rims, high = gauge_shapes(least, largest, figures, self.scales)
+        at = vector_slices(self.variant.entries)
         return Gauges(
-            at=vector_slices(self.variant.entries),
+            width=at["alarm"].stop,
+            at=at,
+            places=slice(at["agent"].start, at["coin"].stop),
+            tiles=slice(at["coins" if "coins" in at else "light"].start, at["light"].stop),
             bars=bars(self.variant.endless),
             readings=readings(self.variant.endless),
             shapes=shapes,
