@@ -11,14 +11,16 @@ seeds: how far the IQM would move with other seeds. A single seed cannot tell, a
 Shape letters: R seeds (training runs) of an agent, M levels, P points of a curve, B bootstrap resamples.
 """
 
-import importlib
+import contextlib
 import itertools
 import json
 import os
 import sys
+import textwrap
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from types import ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -26,6 +28,10 @@ import numpy as np
 import torch
 import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tqdm import tqdm
+
+import ppo_gru
+import ppo_trxl
 
 try:
     from matplotlib import color_sequences
@@ -36,6 +42,7 @@ try:
 except ImportError as error:
     raise SystemExit(f'evaluate.py needs {error.name}: pip install -e ".[eval]"') from None
 
+SCRIPTS = {"ppo_gru": ppo_gru, "ppo_trxl": ppo_trxl}
 # A family's own metric (6.1.3), by the beginning of the id; any other environment's is the return.
 OWN_METRIC = {
     "MortarMayhem": "commands_completed",
@@ -112,7 +119,7 @@ def summary(agent: str, paths: list[str], scores: dict[str, np.ndarray]) -> dict
             "interval": None if ends is None else ends.tolist(),
             "scores": values.tolist(),
         }
-    return {"agent": agent, "seeds": paths, "metrics": metrics}
+    return {"agent": agent, "runs": paths, "metrics": metrics}
 
 
 def table(agents: list[dict[str, Any]]) -> str:
@@ -122,13 +129,13 @@ def table(agents: list[dict[str, Any]]) -> str:
         for agent in agents:
             score = agent["metrics"][metric]
             ends = "none: one seed" if score["interval"] is None else "{:.3f} to {:.3f}".format(*score["interval"])
-            cells = (metric, agent["agent"], len(agent["seeds"]), f"{score['mean']:.3f}", f"{score['iqm']:.3f}", ends)
+            cells = (metric, agent["agent"], len(agent["runs"]), f"{score['mean']:.3f}", f"{score['iqm']:.3f}", ends)
             lines.append("| {} | {} | {} | {} | {} | {} |".format(*cells))
     return "\n".join(lines)
 
 
 # ---- AGENTS ----
-def task_of(args: dict[str, str]) -> str:
+def task_of(args: dict[str, Any]) -> str:
     """Name what was learned: runs of another environment, or with other reset parameters, do not compare."""
     options = args.get("env_options", "{}")
     return args["env_id"] + (f" {options}" if options != "{}" else "")
@@ -140,7 +147,7 @@ def own_metric(env_id: str) -> str:
     return next((metric for start, metric in OWN_METRIC.items() if name.startswith(start)), "return")
 
 
-def tasks_of(runs: dict[str, dict[str, str]], title: Callable) -> dict[str, dict[str, list[str]]]:
+def tasks_of(runs: dict[str, dict[str, Any]], title: Callable) -> dict[str, dict[str, list[str]]]:
     """Sort runs, arguments by path, into tasks and agents: the paths of an agent's seeds by title and label."""
     tasks = defaultdict(dict)
     for path, args in runs.items():
@@ -148,7 +155,7 @@ def tasks_of(runs: dict[str, dict[str, str]], title: Callable) -> dict[str, dict
     return {name: agents_of(members) for name, members in tasks.items()}
 
 
-def agents_of(runs: dict[str, dict[str, str]]) -> dict[str, list[str]]:
+def agents_of(runs: dict[str, dict[str, Any]]) -> dict[str, list[str]]:
     """Put the runs that differ in nothing but the seed together; runs: their arguments by path.
 
     Raises ValueError if two of them have the same seed too, since they tell no more than one.
@@ -164,7 +171,7 @@ def agents_of(runs: dict[str, dict[str, str]]) -> dict[str, list[str]]:
     return dict(zip(labels([runs[paths[0]] for paths in members]), members, strict=True))
 
 
-def labels(agents: list[dict[str, str]]) -> list[str]:
+def labels(agents: list[dict[str, Any]]) -> list[str]:
     """Name each agent by exp_name, and if these are not all different, by the arguments that are."""
     names = [args["exp_name"] for args in agents]
     if len(set(names)) == len(names):
@@ -209,27 +216,37 @@ def curve_name(metric: str, runs: list[EventAccumulator]) -> str:
     raise ValueError(f"the runs have no curve of {metric} in common; they all have {known or 'none of an episode yet'}")
 
 
+def read_curve(run: EventAccumulator, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the steps and values of a scalar, without those that are no number; raise ValueError if none is."""
+    points = [(point.step, point.value) for point in run.Scalars(name) if np.isfinite(point.value)]
+    if not points:
+        raise ValueError(f"{run.path} has no number in its curve of {name}")
+    steps, values = np.array(points).T
+    return steps, values
+
+
 def align(runs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Bring curves (steps, values) to common steps (P,): return these and scores (P, R, 1).
 
-    The steps are those of all runs, as far as every run reaches; between its own, a run's values are interpolated.
+    The steps are those of all runs, as far as every run reaches; between its own, a run's values are interpolated. More
+    than POINTS become so many by the mean of neighbours. Raises ValueError if runs have no steps in common.
     """
     first, last = max(steps[0] for steps, _ in runs), min(steps[-1] for steps, _ in runs)
     if first > last:
         raise ValueError("the curves of an agent's seeds have no steps in common; leave out the shortest run")
     steps = np.unique(np.concatenate([steps for steps, _ in runs]))
     steps = steps[(first <= steps) & (steps <= last)]
-    scores = np.stack([np.interp(steps, *run) for run in runs], axis=-1)  # (points, R)
+    values = np.stack([np.interp(steps, *run) for run in runs], axis=-1)  # (all steps, R)
     parts = np.array_split(np.arange(len(steps)), min(len(steps), POINTS))
-    return np.array([steps[part].mean() for part in parts]), np.stack([scores[part].mean(0) for part in parts])[..., None]
+    scores = np.stack([values[part].mean(0) for part in parts])[..., None]  # (P, R, 1)
+    return np.array([steps[part].mean() for part in parts]), scores
 
 
 def draw_metric(axis: Axes, name: str, agents: dict[str, list[EventAccumulator]]) -> dict[str, np.ndarray]:
-    """Draw the scalar of every agent, seeds by label; return each one's last scores (R, 1)."""
+    """Draw a scalar of every agent, its runs by label; return each one's last scores (R, 1)."""
     last = {}
-    for color, (label, runs) in zip(itertools.cycle(color_sequences["petroff10"]), agents.items()):
-        points = [run.Scalars(name) for run in runs]
-        steps, scores = align([(np.array([p.step for p in run]), np.array([p.value for p in run])) for run in points])
+    for (label, runs), color in zip(agents.items(), itertools.cycle(color_sequences["petroff10"]), strict=False):
+        steps, scores = align([read_curve(run, name) for run in runs])
         axis.plot(steps, iqm(scores), color=color, label=f"{label}, {len(runs)} seed{'s' * (len(runs) > 1)}")
         if (band := interval(scores)) is not None:
             axis.fill_between(steps, *band, color=color, alpha=0.2, linewidth=0)
@@ -237,56 +254,125 @@ def draw_metric(axis: Axes, name: str, agents: dict[str, list[EventAccumulator]]
     axis.set(xlabel="steps", ylabel=name)
     axis.xaxis.set_major_formatter(EngFormatter(sep=" "))
     axis.grid(alpha=0.3)
-    axis.legend(frameon=False)
     return last
 
 
-def draw_curves(config: Config) -> None:
-    """Write the picture, a row for each task and a column for each metric, and print where the curves end."""
+def draw_curves(config: Config) -> list[dict[str, Any]]:
+    """Draw a row of pictures for each task, a column for each metric; print where the curves end, and return it."""
     events = {path: read_run(path) for path in dict.fromkeys(config.curves)}
     tasks = tasks_of({path: hyperparameters(run) for path, run in events.items()}, task_of)
     columns = len(config.metrics) or 1
-    figure = Figure(figsize=(5.5 * columns, 3.6 * len(tasks)), layout="constrained")
-    rows = figure.subplots(len(tasks), columns, squeeze=False)
-    for axes, (title, agents) in zip(rows, tasks.items(), strict=True):
+    figure = Figure(figsize=(5.5 * columns, 4 * len(tasks)), layout="constrained")
+    report = []
+    for axes, (title, agents) in zip(figure.subplots(len(tasks), columns, squeeze=False), tasks.items(), strict=True):
         runs = {label: [events[path] for path in paths] for label, paths in agents.items()}
         last = defaultdict(dict)
         for axis, metric in zip(axes, config.metrics or [own_metric(title)], strict=True):
-            name = curve_name(metric, [run for each in runs.values() for run in each])
-            axis.set_title(title, wrap=True)
+            name = curve_name(metric, list(itertools.chain(*runs.values())))
             for label, scores in draw_metric(axis, name, runs).items():
                 last[label][name] = scores
-        print(f"{title}, where the curves end\n")
-        print(table([summary(label, paths, last[label]) for label, paths in agents.items()]), end="\n\n")
+        axes[0].set_title(textwrap.fill(title, 50), loc="left", fontsize="medium")
+        axes[0].legend(loc="upper left", bbox_to_anchor=(0, -0.17), frameon=False)  # below, clear of the curves
+        report.append({"task": title, "agents": [summary(label, agents[label], last[label]) for label in agents]})
+        print(f"{title}, where the curves end\n\n{table(report[-1]['agents'])}\n")
     for name in (f"{config.out}.png", f"{config.out}.svg"):
         figure.savefig(name, dpi=150)
-        print(f"wrote {name}")
+    return report
 
 
 # ---- SCORES ----
-def load_args(path: str) -> tuple[Any, dict[str, str]]:
-    """Return the script that trained a checkpoint, and its arguments as text; raise ValueError if it is none."""
-    draw_curves(config)
+def load(path: str, config: Config) -> tuple[ModuleType, Any]:
+    """Return the script that trained a checkpoint, and its arguments with this evaluation's settings.
+
+    Raises ValueError if the file is no checkpoint, OSError if it cannot be read.
+    """
+    script = ppo_gru  # whose load_model says what is wrong with a file that tells no script
+    with contextlib.suppress(Exception):
+        script = SCRIPTS[torch.load(path, map_location="cpu", weights_only=True)["script"]]
+    args, _ = script.load_model(path)
+    settings = {"eval_levels": config.levels, "eval_repeats": config.repeats, "eval_max_steps": config.max_steps}
+    return script, replace(args, cuda=config.cuda, **settings)
 
 
-def play_levels(script, path, config):
-    draw_curves(config)
+def play(path: str, script: ModuleType, args: Any, seed: int) -> dict[str, np.ndarray]:
+    """Let a checkpoint's agent play the levels; return numbers (M,) by name, each level's mean over its repeats.
+
+    Raises what the script raises for an environment that is not there or weights that do not fit.
+    """
+    torch.manual_seed(seed)
+    device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
+    envs = script.make_envs(args, args.eval_levels * args.eval_repeats)
+    _, infos = envs.reset(options=script.reset_options(args.env_id, args.env_options))
+    agent = script.make_agent(envs, infos, args, device)
+    script.load_weights(agent, path)
+    found = script.evaluate(agent, envs, args)
+    envs.close()
+    return {name: numbers.reshape(args.eval_levels, args.eval_repeats).mean(1) for name, numbers in found.items()}
 
 
-def score_checkpoints(config: Config) -> None:
-    """Play the levels with every checkpoint's agent; print a table for each task, and write the JSON file."""
-    draw_curves(config)
+def title_of(args: dict[str, Any]) -> str:
+    """Name the task and the levels of it that are played."""
+    first = args["start_level"] + args["num_levels"]
+    return f"{task_of(args)}, levels {first} to {first + args['eval_levels'] - 1}, {args['eval_repeats']} times each"
+
+
+def choose_metrics(wanted: tuple[str, ...], env_id: str, played: list[dict[str, np.ndarray]]) -> list[str]:
+    """Return the metrics to report: those wanted, else the family's own, return, length and falls.
+
+    Only what every episode told can be averaged; one that was cut short tells return and length so far, and no more.
+    Raises ValueError for a wanted metric that they did not all tell.
+    """
+    known = [name for name in played[0] if all(name in each and not np.isnan(each[name]).any() for each in played)]
+    if unknown := [name for name in wanted if name not in known]:
+        raise ValueError(f"not every episode told {unknown[0]}; they told {', '.join(known)}")
+    usual = dict.fromkeys([own_metric(env_id), "return", "length", "num_fails"])
+    return list(wanted) or [name for name in usual if name in known]
+
+
+def score_checkpoints(config: Config) -> list[dict[str, Any]]:
+    """Play the levels with every checkpoint's agent; print a table for each task, and return what is in it."""
+    models = {path: load(path, config) for path in dict.fromkeys(config.checkpoints)}
+    arguments = {path: {"script": script.__name__, **asdict(args)} for path, (script, args) in models.items()}
+    tasks = tasks_of(arguments, title_of)
+    played = {path: play(path, *model, config.seed) for path, model in tqdm(models.items(), unit=" agents")}
+    report = []
+    for title, agents in tasks.items():
+        members = [played[path] for paths in agents.values() for path in paths]
+        metrics = choose_metrics(config.metrics, title, members)
+        summaries = []
+        for label, paths in agents.items():
+            scores = {name: np.stack([played[path][name] for path in paths]) for name in metrics}  # (R, M) each
+            summaries.append(summary(label, paths, scores))
+        finished = float(np.mean([each["finished"] for each in members]))
+        report.append({"task": title, "finished": finished, "agents": summaries})
+        print(f"{title}\n\n{table(summaries)}\n")
+        if finished < 1:
+            print(f"--max-steps cut {1 - finished:.2%} of the episodes; what only their end tells is left out\n")
+    return report
 
 
 def main(config: Config) -> None:
-    """Do what the command line asks for; raise ValueError or OSError, in one line for the user, if that cannot be."""
+    """Do what the command line asks for.
+
+    Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
+    """
     if bool(config.checkpoints) == bool(config.curves):
-        raise ValueError("give checkpoints to score (runs/*/model.pt) or --curves with run folders to draw")
-    draw_curves(config)
+        raise ValueError("give either checkpoints to play with (runs/*/model.pt), or --curves and run folders (runs/*)")
+    for name, low in (("levels", 1), ("repeats", 1), ("max_steps", 1), ("seed", 0)):
+        if getattr(config, name) < low:
+            raise ValueError(f"{ppo_gru.flag(name)} is {getattr(config, name)}; it must be {low} or more")
+    for path in (config.json, config.out):
+        if path is not None and not os.path.isdir(os.path.dirname(path) or "."):
+            raise ValueError(f"there is no folder {os.path.dirname(path)} to write to")
+    report = draw_curves(config) if config.curves else score_checkpoints(config)
+    if config.json is not None:
+        with open(config.json, "w") as file:
+            json.dump(report, file, indent=1)
 
 
 if __name__ == "__main__":
+    config = tyro.cli(Config)
     try:
-        main(tyro.cli(Config))
+        main(config)
     except (ValueError, OSError, ImportError, gym.error.Error) as error:
         sys.exit(f"evaluate.py: {' '.join(str(error).split())}")
