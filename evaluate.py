@@ -247,7 +247,9 @@ def draw_metric(axis: Axes, name: str, agents: dict[str, list[EventAccumulator]]
     last = {}
     for (label, runs), color in zip(agents.items(), itertools.cycle(color_sequences["petroff10"]), strict=False):
         steps, scores = align([read_curve(run, name) for run in runs])
-        axis.plot(steps, iqm(scores), color=color, label=f"{label}, {len(runs)} seed{'s' * (len(runs) > 1)}")
+        marker = "o" if len(steps) == 1 else None  # a line of one point is not to be seen
+        seeds = f"{len(runs)} seed{'s' * (len(runs) > 1)}"
+        axis.plot(steps, iqm(scores), color=color, marker=marker, label=f"{label}, {seeds}")
         if (band := interval(scores)) is not None:
             axis.fill_between(steps, *band, color=color, alpha=0.2, linewidth=0)
         last[label] = scores[-1]
@@ -260,14 +262,16 @@ def draw_metric(axis: Axes, name: str, agents: dict[str, list[EventAccumulator]]
 def draw_curves(config: Config) -> list[dict[str, Any]]:
     """Draw a row of pictures for each task, a column for each metric; print where the curves end, and return it."""
     events = {path: read_run(path) for path in dict.fromkeys(config.curves)}
-    tasks = tasks_of({path: hyperparameters(run) for path, run in events.items()}, task_of)
+    args = {path: hyperparameters(run) for path, run in events.items()}
+    tasks = tasks_of(args, task_of)
     columns = len(config.metrics) or 1
     figure = Figure(figsize=(5.5 * columns, 4 * len(tasks)), layout="constrained")
     report = []
     for axes, (title, agents) in zip(figure.subplots(len(tasks), columns, squeeze=False), tasks.items(), strict=True):
         runs = {label: [events[path] for path in paths] for label, paths in agents.items()}
         last = defaultdict(dict)
-        for axis, metric in zip(axes, config.metrics or [own_metric(title)], strict=True):
+        env_id = next(args[path]["env_id"] for paths in agents.values() for path in paths)
+        for axis, metric in zip(axes, config.metrics or [own_metric(env_id)], strict=True):
             name = curve_name(metric, list(itertools.chain(*runs.values())))
             for label, scores in draw_metric(axis, name, runs).items():
                 last[label][name] = scores
@@ -337,13 +341,13 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
     played = {path: play(path, *model, config.seed) for path, model in tqdm(models.items(), unit=" agents")}
     report = []
     for title, agents in tasks.items():
-        members = [played[path] for paths in agents.values() for path in paths]
-        metrics = choose_metrics(config.metrics, title, members)
+        paths = list(itertools.chain(*agents.values()))
+        metrics = choose_metrics(config.metrics, arguments[paths[0]]["env_id"], [played[path] for path in paths])
         summaries = []
-        for label, paths in agents.items():
-            scores = {name: np.stack([played[path][name] for path in paths]) for name in metrics}  # (R, M) each
-            summaries.append(summary(label, paths, scores))
-        finished = float(np.mean([each["finished"] for each in members]))
+        for label, members in agents.items():
+            scores = {name: np.stack([played[path][name] for path in members]) for name in metrics}  # (R, M) each
+            summaries.append(summary(label, members, scores))
+        finished = float(np.mean([played[path]["finished"] for path in paths]))
         report.append({"task": title, "finished": finished, "agents": summaries})
         print(f"{title}\n\n{table(summaries)}\n")
         if finished < 1:
