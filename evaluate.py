@@ -65,7 +65,8 @@ class Config:
     checkpoints: tyro.conf.Positional[tuple[str, ...]] = ()
     """model.pt files that --save-model wrote"""
     levels: int = 50
-    """levels to play: those that follow the training levels, from start_level + num_levels on"""
+    """levels to play, from start_level + num_levels on: those that follow the training levels (an agent that trained
+    without a limit, --num-levels 0, has met none of the numbered levels)"""
     repeats: int = 3
     """how often to play each level"""
     max_steps: int = 10_000
@@ -197,10 +198,14 @@ def read_run(folder: str) -> EventAccumulator:
 
 
 def hyperparameters(events: EventAccumulator) -> dict[str, str]:
-    """Return a run's arguments as text, from the Markdown table that its TensorBoard file begins with."""
+    """Return a run's arguments as text, from the Markdown table in its TensorBoard file.
+
+    An argument that is younger than the run has its default, one that no longer exists is left out.
+    """
     rows = events.Tensors("hyperparameters/text_summary")[0].tensor_proto.string_val[0].decode().splitlines()[2:]
-    args = dict(row[1:-1].split("|", 1) for row in rows)
-    return {"script": "ppo_trxl" if "trxl_dim" in args else "ppo_gru"} | args
+    given = dict(row[1:-1].split("|", 1) for row in rows)
+    script = ppo_trxl if "trxl_dim" in given else ppo_gru
+    return {"script": script.__name__} | {name: given.get(name, str(v)) for name, v in asdict(script.Args()).items()}
 
 
 def curve_name(metric: str, runs: list[EventAccumulator]) -> str:

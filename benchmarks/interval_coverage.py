@@ -40,11 +40,12 @@ def coverage(seeds: int, spread: float) -> list[float]:
 
 def main() -> None:
     """Print the table."""
-    print("| seeds | their spread | seeds drawn whole | drawn anew for each level |\n|---:|---:|---:|---:|")
+    print("| seeds | standard deviation between seeds | seeds drawn whole | drawn anew for each level |")
+    print("|---:|---:|---:|---:|")
     for seeds in (3, 5, 10):
         for spread in (0.0, 0.05, 0.15):
             whole, apart = coverage(seeds, spread)
-            print(f"| {seeds} | {spread:.2f} | {whole:.0%} | {apart:.0%} |", flush=True)
+            print(f"| {seeds} | {spread:.2f} | {100 * whole:.0f} % | {100 * apart:.0f} % |", flush=True)
 
 
 if __name__ == "__main__":

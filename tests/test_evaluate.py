@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 import xml.etree.ElementTree
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 from PIL import Image
+from torch.utils.tensorboard import SummaryWriter
 
 import evaluate
 import memory_gym_envs
@@ -184,10 +186,31 @@ def test_a_curve_is_the_iqm_with_its_band(agents, scalars):
     assert axis.get_legend_handles_labels()[1] == ["gru, 2 seeds", "trxl, 1 seed"]
 
 
+def test_hyperparameters_are_those_of_the_run(agents):
+    for folder in agents:
+        script = ppo_trxl if "trxl" in folder else ppo_gru
+        args, _ = script.load_model(f"{folder}/model.pt")
+        text = {name: str(value) for name, value in asdict(args).items()}
+        assert evaluate.hyperparameters(evaluate.read_run(folder)) == {"script": script.__name__} | text
+
+
 def test_evaluations_are_shown_before_training_episodes(agents):
     runs = [evaluate.read_run(folder) for folder in agents]
     assert evaluate.curve_name("length", runs) == "eval/length"
     assert evaluate.curve_name("episode/length", runs[:1]) == "episode/length"
+
+
+def test_the_arguments_of_an_older_run():
+    """What it could not say has the default, so that it still counts as a seed of the same agent."""
+    with SummaryWriter("old") as writer:
+        writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|3|\n|num_envs|4|\n|no_longer|1|\n|env_id|A-v0|")
+        writer.add_scalar("eval/return", float("nan"), 5)
+        writer.add_scalar("eval/return", 2.0, 10)
+    run = evaluate.read_run("old")
+    defaults = {name: str(value) for name, value in asdict(ppo_gru.Args()).items()}
+    changed = {"script": "ppo_gru", "seed": "3", "num_envs": "4", "env_id": "A-v0"}
+    assert evaluate.hyperparameters(run) == defaults | changed
+    assert [each.tolist() for each in evaluate.read_curve(run, "eval/return")] == [[10], [2]]
 
 
 # ---- scores ----
