@@ -308,12 +308,12 @@ def play(path: str, script: ModuleType, args: Any, seed: int) -> dict[str, np.nd
 
     Raises what the script raises for an environment that is not there or weights that do not fit.
     """
-    torch.manual_seed(seed)
     device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
     envs = script.make_envs(args, args.eval_levels * args.eval_repeats)
     _, infos = envs.reset(options=script.reset_options(args.env_id, args.env_options))
     agent = script.make_agent(envs, infos, args, device)
     script.load_weights(agent, path)
+    torch.manual_seed(seed)
     found = script.evaluate(agent, envs, args)
     envs.close()
     return {name: numbers.reshape(args.eval_levels, args.eval_repeats).mean(1) for name, numbers in found.items()}

@@ -225,20 +225,21 @@ def test_scores_are_those_of_the_levels(agents, capsys):
     assert (gru["agent"], gru["runs"]) == ("ppo_gru", list(models[:2]))
     assert (trxl["agent"], trxl["runs"]) == ("ppo_trxl", list(models[2:]))
     assert list(gru["metrics"]) == ["success", "return", "length", "num_fails"]
-    lengths = np.array(trxl["metrics"]["length"]["scores"])
-    assert lengths.shape == (2, 4)
-    low, high = trxl["metrics"]["length"]["interval"]
-    assert low <= trxl["metrics"]["length"]["iqm"] <= high
-    assert f"| length | ppo_trxl | 2 | {lengths.mean():.3f} |" in said
+    falls = np.array(trxl["metrics"]["num_fails"]["scores"])
+    assert falls.shape == (2, 4)
+    low, high = trxl["metrics"]["num_fails"]["interval"]
+    assert low <= trxl["metrics"]["num_fails"]["iqm"] <= high
+    assert f"| num_fails | ppo_trxl | 2 | {falls.mean():.3f} |" in said
 
     args, _ = ppo_trxl.load_model(models[2])
-    args.eval_levels, args.eval_repeats, args.eval_max_steps = 4, 2, 1000
+    args.eval_levels, args.eval_repeats = 4, 2
     envs = ppo_trxl.make_envs(args, 8)
     agent = ppo_trxl.make_agent(envs, {}, args, torch.device("cpu"))
     ppo_trxl.load_weights(agent, models[2])
     torch.manual_seed(1)
-    found = ppo_trxl.evaluate(agent, envs, args)["length"]
-    assert lengths[0].tolist() == [found[2 * level : 2 * level + 2].mean() for level in range(4)]
+    found = ppo_trxl.evaluate(agent, envs, args)["num_fails"]
+    assert falls[0].tolist() == [np.mean(found[2 * level : 2 * level + 2]) for level in range(4)]
+    assert len(set(falls[0])) > 1, "levels that can be told apart"
 
 
 def test_episodes_cut_short(agents, capsys):
@@ -248,6 +249,16 @@ def test_episodes_cut_short(agents, capsys):
     assert task["finished"] == 0
     assert list(task["agents"][0]["metrics"]) == ["return", "length"]
     assert "--max-steps cut 100.00% of the episodes" in capsys.readouterr().out
+
+
+def test_metrics_that_every_episode_told():
+    told = {"return": np.zeros(2), "length": np.ones(2), "finished": np.ones(2), "success": np.zeros(2)}
+    assert evaluate.choose_metrics((), "MysteryPath-v0", [told, told]) == ["success", "return", "length"]
+    assert evaluate.choose_metrics(("finished",), "MysteryPath-v0", [told]) == ["finished"]
+    cut = told | {"success": np.array([0, np.nan])}
+    assert evaluate.choose_metrics((), "MysteryPath-v0", [told, cut]) == ["return", "length"]
+    with pytest.raises(ValueError, match="not every episode told success; they told return, length, finished"):
+        evaluate.choose_metrics(("success",), "MysteryPath-v0", [told, cut])
 
 
 # ---- bad input ----
