@@ -280,7 +280,7 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
             name = curve_name(metric, list(itertools.chain(*runs.values())))
             for label, scores in draw_metric(axis, name, runs).items():
                 last[label][name] = scores
-        axes[0].set_title(textwrap.fill(title, 50), loc="left", fontsize="medium")
+        axes[0].set_title(textwrap.fill(title, 55 * columns), loc="left", fontsize="medium")
         axes[0].legend(loc="upper left", bbox_to_anchor=(0, -0.17), frameon=False)  # below, clear of the curves
         report.append({"task": title, "agents": [summary(label, agents[label], last[label]) for label in agents]})
         print(f"{title}, where the curves end\n\n{table(report[-1]['agents'])}\n")
