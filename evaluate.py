@@ -99,8 +99,8 @@ def interval(scores: np.ndarray) -> np.ndarray | None:
     """Return the ends (2, ...) of the IQM's 95 % bootstrap interval for scores (..., R, M); None for a single seed.
 
     Levels are the strata: a resample has R scores of each. A drawn seed brings its scores on all levels along, for they
-    come from the same weights. To draw anew for each level, as if every level had been trained on by itself, makes
-    intervals several times too narrow: see benchmarks/interval_coverage.py.
+    come from the same weights. To draw anew for each level is right where each has been trained on by itself; here it
+    makes the interval far too narrow wherever seeds differ, as benchmarks/interval_coverage.py shows.
     """
     seeds = scores.shape[-2]
     if seeds < 2:
@@ -138,8 +138,7 @@ def table(agents: list[dict[str, Any]]) -> str:
 # ---- AGENTS ----
 def task_of(args: dict[str, Any]) -> str:
     """Name what was learned: runs of another environment, or with other reset parameters, do not compare."""
-    options = args.get("env_options", "{}")
-    return args["env_id"] + (f" {options}" if options != "{}" else "")
+    return args["env_id"] if args["env_options"] == "{}" else f"{args['env_id']} {args['env_options']}"
 
 
 def own_metric(env_id: str) -> str:
