@@ -127,8 +127,11 @@ def test_a_model_of_another_network(tiny):
         ValueError, match="another network, trained with --env-id CueRecall-v0 --memory gru --hidden-size 32"
     ):
         ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path, hidden_size=64))
-    torch.save({"args": {}, "weights": 1}, path)
+    torch.save({"script": "ppo_gru", "args": {}, "weights": 1}, path)
     with pytest.raises(ValueError, match="another network"):
+        ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path))
+    torch.save({"script": "ppo_trxl", "args": {}, "weights": {}}, path)
+    with pytest.raises(ValueError, match=r"was trained by ppo_trxl\.py, not by ppo_gru\.py"):
         ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path))
     torch.save({"weights": 1}, path)
     with pytest.raises(ValueError, match="is not a model that --save-model wrote"):
