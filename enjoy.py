@@ -34,14 +34,13 @@ try:
 except ImportError:  # main tells how to get them
     Image = get_plotlyjs = None
 
-SCRIPTS = {"ppo_gru": ppo_gru, "ppo_trxl": ppo_trxl}
 SHEET = 16  # frames in one picture: a neighbour costs few bytes, and a jump makes a browser decode one sheet only
 VIEW, RECONSTRUCTION = "agent's view", "reconstruction"
 LARGEST = 336  # pixels of a frame's longer side
 KNOWN = ("reward", "length")  # of a final info, told already
 FREE = {"horizontal": ["none", "left", "right"], "vertical": ["none", "up", "down"]}
-GRID = {"": ["none", "turn left", "turn right", "forward"]}
-ENDLESS_PATH = {"": ["none", "right", "up", "down"]}
+GRID = {"action": ["none", "turn left", "turn right", "forward"]}
+ENDLESS_PATH = {"action": ["none", "right", "up", "down"]}
 
 
 @dataclass
@@ -58,24 +57,51 @@ class Config:
     """where to stop an episode that does not end"""
 
 
+class Video:
+    """Frames, packed as they come: SHEET of them below one another make a WebP picture of `sheets`, a data URL.
+
+    What a frame shares with those above it costs nearly nothing.
+    """
+
+    def __init__(self, lossless: bool):
+        self.lossless, self.sheets, self.waiting, self.shape = lossless, [], [], (0, 0)
+
+    def add(self, frame: np.ndarray) -> None:
+        """Add a frame (h, w) or (h, w, 3), uint8."""
+        self.shape = frame.shape
+        self.waiting.append(frame)
+        if len(self.waiting) == SHEET:
+            self.pack()
+
+    def pack(self) -> None:
+        """Pack the frames that are waiting for their sheet to fill."""
+        if self.waiting:
+            file = io.BytesIO()
+            sheet = Image.fromarray(np.concatenate(self.waiting))
+            sheet.save(file, "WEBP", lossless=self.lossless, quality=60, method=2)
+            self.sheets.append("data:image/webp;base64," + base64.b64encode(file.getvalue()).decode())
+            self.waiting = []
+
+
 @dataclass
 class Episode:
-    """T steps: what could be seen when the agent chose an action, what it thought, and what the action earned."""
+    """T steps: what was to be seen when the agent chose an action, what it thought, and what the action earned."""
 
-    videos: dict[str, list[np.ndarray]] = field(default_factory=dict)  # by name, T frames (h, w) or (h, w, 3), uint8
+    videos: dict[str, Video] = field(default_factory=dict)
     policy: list[list[np.ndarray]] = field(default_factory=list)  # T x A, the probabilities of a branch's actions
     actions: list[list[int]] = field(default_factory=list)  # T x A
-    lines: dict[str, list[float]] = field(default_factory=dict)  # by name, T numbers
+    values: list[float] = field(default_factory=list)  # T
+    entropies: list[float] = field(default_factory=list)  # T
+    rewards: list[float] = field(default_factory=list)  # T
     truth: list[np.ndarray] = field(default_factory=list)  # T x (G,); empty where the environment tells none
     estimate: list[np.ndarray] = field(default_factory=list)  # T x (G,); empty without an estimator
     attention: list[np.ndarray] = field(default_factory=list)  # T x (K, H, M or fewer), the oldest item first
-    final: dict[str, float] = field(default_factory=dict)  # numbers of the final info; empty if it was cut short
+    finished: bool = False  # not cut short
+    final: dict[str, float] = field(default_factory=dict)  # numbers of the final info
 
-    def add(self, videos: dict[str, np.ndarray], lines: dict[str, float]) -> None:
-        """Add a step's frames and numbers."""
-        for store, news in ((self.videos, videos), (self.lines, lines)):
-            for name, value in news.items():
-                store.setdefault(name, []).append(value)
+    def film(self, name: str, frame: np.ndarray) -> None:
+        """Add a frame to a video. What a network draws is noise in its last bits: that one need not be exact."""
+        self.videos.setdefault(name, Video(lossless=name != RECONSTRUCTION)).add(frame)
 
 
 # ---- PLAY ----
@@ -86,27 +112,22 @@ def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, options: dict 
     Raises ValueError for options that the environment does not have, or an episode that the memory cannot hold.
     """
     torch.manual_seed(seed)
-    episode, done = Episode(), False
+    episode = Episode()
     obs, infos = envs.reset(seed=seed, options=options)
     live = agent.memory.initial(1, torch.device("cpu"), max_steps)
-    while not done and len(episode.actions) < max_steps:
-        episode.add(views(envs, obs), {})
+    while not episode.finished and len(episode.actions) < max_steps:
+        for name, frame in views(envs, obs).items():
+            episode.film(name, frame)
         if "ground_truth" in infos:
             episode.truth.append(infos["ground_truth"][0])
         actions, live = think(agent, ppo_gru.as_tensors(obs), live, episode)
         chosen = ppo_gru.to_env_actions(actions, envs.single_action_space)
         obs, rewards, terminated, truncated, infos = envs.step(chosen)
-        episode.add({}, {"reward": float(rewards[0])})
-        done = terminated[0] or truncated[0]
-    if done:
-        final = infos.get("final_info", {})
-        episode.final = {name: value[0].item() for name, value in final.items() if is_number(name, value)}
+        episode.rewards.append(float(rewards[0]))
+        episode.finished = bool(terminated[0] or truncated[0])
+    if episode.finished:
+        episode.final = {name: value.item() for name, value in ppo_gru.final_numbers(infos, np.ones(1, bool))}
     return episode
-
-
-def is_number(name: str, value: Any) -> bool:
-    """Tell whether an entry of the final info is one number a lane."""
-    return not name.startswith("_") and isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "biuf"
 
 
 def think(agent: nn.Module, obs: dict[str, Tensor], live: Any, episode: Episode) -> tuple[Tensor, Any]:
@@ -119,10 +140,10 @@ def think(agent: nn.Module, obs: dict[str, Tensor], live: Any, episode: Episode)
     actions = torch.stack([branch.sample() for branch in policy], -1)
     episode.policy.append([branch.probs[0].numpy() for branch in policy])
     episode.actions.append(actions[0].tolist())
-    episode.add({}, {"state value": values.item(), "entropy": sum(branch.entropy().item() for branch in policy)})
+    episode.values.append(values.item())
+    episode.entropies.append(sum(branch.entropy().item() for branch in policy))
     if agent.decoder is not None:
-        painted = agent.decoder(features).sigmoid()[0].numpy()
-        episode.add({RECONSTRUCTION: displayable(painted)}, {})
+        episode.film(RECONSTRUCTION, displayable(agent.decoder(features).sigmoid()[0].numpy()))
     if agent.estimator is not None:
         episode.estimate.append(agent.estimator(features)[0].numpy())
     return actions, live
@@ -141,9 +162,12 @@ def views(envs: gym.vector.VectorEnv, obs: np.ndarray | dict[str, np.ndarray]) -
 
 
 def rendered(envs: gym.vector.VectorEnv, mode: str) -> np.ndarray:
-    """Return the lane's picture in this render mode, reduced to LARGEST pixels."""
+    """Return the lane's picture in this render mode, reduced to LARGEST pixels; raise ValueError if there is none."""
     envs.unwrapped.render_mode = mode  # a Memory Gym environment draws in both, whichever it was made with
-    image = Image.fromarray(np.asarray(envs.render()[0]))
+    frame = (envs.render() or [None])[0]
+    if not isinstance(frame, np.ndarray):
+        raise ValueError(f"{envs.spec.id} draws no pictures (render_mode {mode}); there would be nothing to watch")
+    image = Image.fromarray(frame)
     image.thumbnail((LARGEST, LARGEST))
     return np.asarray(image)
 
@@ -164,23 +188,31 @@ def displayable(pixels: np.ndarray) -> np.ndarray:
 # ---- PAGE ----
 def page_data(episode: Episode, title: str, facts: dict[str, Any], env_id: str, fps: float) -> dict[str, Any]:
     """Return all that the page shows, as JSON can hold it."""
+    lines = {"state value": episode.values, "entropy": episode.entropies, "reward": episode.rewards}
     branches = zip(branch_names(env_id, episode.policy[0]).items(), zip(*episode.policy, strict=True), strict=True)
     return {
         "title": title,
         "facts": facts,
         "steps": len(episode.actions),
         "fps": fps,
-        "videos": [video(name, frames) for name, frames in episode.videos.items()],
+        "videos": [video_data(name, video) for name, video in episode.videos.items()],
         "branches": [
             {"name": name, "actions": actions, "probabilities": rounded(probabilities)}
             for (name, actions), probabilities in branches
         ],
         "actions": episode.actions,
-        "lines": {name: rounded(line) for name, line in episode.lines.items()},
+        "lines": {name: rounded(line) for name, line in lines.items()},
         "truth": rounded(episode.truth),
         "estimate": rounded(episode.estimate),
         "attention": packed(episode.attention),
     }
+
+
+def video_data(name: str, video: Video) -> dict[str, Any]:
+    """Return a video as JSON can hold it."""
+    video.pack()
+    height, width = video.shape[:2]
+    return {"name": name, "height": height, "width": width, "per_sheet": SHEET, "sheets": video.sheets}
 
 
 def branch_names(env_id: str, branches: list[np.ndarray]) -> dict[str, list[str]]:
@@ -194,17 +226,6 @@ def branch_names(env_id: str, branches: list[np.ndarray]) -> dict[str, list[str]
 def rounded(numbers: list) -> list:
     """Round to what a plot can show: digits cost bytes."""
     return np.round(np.array(numbers, np.float64), 5).tolist()
-
-
-def video(name: str, frames: list[np.ndarray]) -> dict[str, Any]:
-    """Pack a video: SHEET frames below one another make a picture, in which equal parts of neighbours cost nothing."""
-    lossless, sheets = name != RECONSTRUCTION, []  # what a network paints is noise in its last bits
-    for start in range(0, len(frames), SHEET):
-        file = io.BytesIO()
-        sheet = Image.fromarray(np.concatenate(frames[start : start + SHEET]))
-        sheet.save(file, "WEBP", lossless=lossless, quality=60, method=2)
-        sheets.append("data:image/webp;base64," + base64.b64encode(file.getvalue()).decode())
-    return {"name": name, "height": len(frames[0]), "width": frames[0].shape[1], "per_sheet": SHEET, "sheets": sheets}
 
 
 def packed(attention: list[np.ndarray]) -> dict[str, Any] | None:
@@ -296,6 +317,7 @@ const INK = "#23282f", SOFT = "#6a7280", LINE = "#2d5d8c", ACCENT = "#c8553d", P
 const FONT = {family: "system-ui, sans-serif", size: 12, color: SOFT};
 const CALM = {displayModeBar: false, responsive: true};
 const AXIS = {zeroline: false, gridcolor: "#eef0f2", linecolor: "#cfd3d9", fixedrange: true, nticks: 4};
+const nth = (axis, i) => axis + (i ? i + 1 : "");  // what Plotly calls the i-th axis, from 0
 let now = 0, shown = 0, timer = null;
 
 // Header.
@@ -330,11 +352,11 @@ function show(step) {
 
 // Bars: one group a branch, the chosen action in another colour.
 const bars = page.branches.map((branch, i) => ({type: "bar", x: branch.actions.map(name => name.replace(" ", "<br>")),
-  y: branch.probabilities[0], xaxis: "x" + (i + 1), cliponaxis: false, textposition: "outside", hoverinfo: "skip"}));
+  y: branch.probabilities[0], xaxis: nth("x", i), cliponaxis: false, textposition: "outside", hoverinfo: "skip"}));
 const barsLayout = {height: 190, margin: {l: 34, r: 4, t: 14, b: 44}, font: FONT, showlegend: false,
   yaxis: {...AXIS, range: [0, 1]}};
-page.branches.forEach((branch, i, {length}) => barsLayout["xaxis" + (i + 1)] = {type: "category", fixedrange: true,
-  tickangle: 0, domain: [(i + (i && 0.06)) / length, (i + 1) / length], title: {text: branch.name, standoff: 4}});
+page.branches.forEach((branch, i, {length}) => barsLayout[nth("xaxis", i)] = {type: "category", fixedrange: true,
+  tickangle: 0, domain: [(i + (i && 0.06)) / length, (i + 1) / length], title: {text: length > 1 ? branch.name : ""}});
 Plotly.newPlot("bars", bars, barsLayout, CALM);
 function drawBars() {
   const chances = page.branches.map(branch => branch.probabilities[now]);
@@ -348,11 +370,11 @@ const look = page.attention;
 const scores = look && new Uint16Array(Uint8Array.from(atob(look.scores), letter => letter.charCodeAt(0)).buffer);
 const rows = Object.keys(page.lines).concat(Array.from({length: look ? look.blocks : 0}, (_, k) => `block ${k + 1}`));
 const hover = "step %{x}: %{y:.4g}<extra></extra>";
-const curves = Object.entries(page.lines).map(([name, y], row) => ({x: steps, y, yaxis: "y" + (row + 1), mode: "lines",
+const curves = Object.entries(page.lines).map(([name, y], row) => ({x: steps, y, yaxis: nth("y", row), mode: "lines",
   line: {color: LINE, width: 1.5, shape: name === "reward" ? "hvh" : "linear"}, hovertemplate: hover}));
 const firstBlock = curves.length;
 for (let k = 0; look && k < look.blocks; k++) {
-  const yaxis = "y" + (firstBlock + k + 1);
+  const yaxis = nth("y", firstBlock + k);
   curves.push({x: [], y: [], yaxis, mode: "lines", fill: "tozeroy", fillcolor: "#dbe5ee", hovertemplate: hover,
     line: {color: PALE, width: 1, shape: "hvh"}});
   curves.push({x: [], y: [], yaxis, mode: "markers", marker: {color: ACCENT, size: 5}, hovertemplate: hover,
@@ -362,11 +384,11 @@ const unit = 1 / (rows.length - 0.24);  // a row and the room above it for its n
 const layout = {height: 62 + (look ? 112 : 200) * rows.length, margin: {l: 58, r: 10, t: 22, b: 40}, font: FONT,
   showlegend: false, hovermode: "x", hoverdistance: -1, bargap: 0, annotations: [],
   xaxis: {...AXIS, fixedrange: false, range: [-0.5, page.steps - 0.5], nticks: 12, title: {text: "step", standoff: 6},
-    anchor: "y" + rows.length},
+    anchor: nth("y", rows.length - 1)},
   shapes: [{type: "line", x0: 0, x1: 0, yref: "paper", y0: 0, y1: 1, line: {color: ACCENT, width: 1}}]};
 rows.forEach((name, row) => {
   const top = 1 - row * unit, rangemode = row < firstBlock ? "normal" : "tozero";
-  layout["yaxis" + (row + 1)] = {...AXIS, domain: [Math.max(top - 0.76 * unit, 0), top], rangemode};
+  layout[nth("yaxis", row)] = {...AXIS, domain: [Math.max(top - 0.76 * unit, 0), top], rangemode};
   const text = row < firstBlock ? name : `attention of ${name}, sum over ${look.heads} heads`;
   layout.annotations.push({text, xref: "paper", yref: "paper", x: 0, y: top, xanchor: "left", yanchor: "bottom",
     showarrow: false, font: {color: INK, size: 13}});
@@ -443,7 +465,7 @@ document.onkeydown = event => {
   else if (event.key === "Home") go(0); else if (event.key === "End") go(page.steps - 1); else return;
   event.preventDefault();
 };
-go(Number(location.hash.slice(1)) || 0);
+go(parseInt(location.hash.slice(1)) || 0);  // page.html#40 opens at step 40
 </script>
 </html>
 """
@@ -455,21 +477,25 @@ def load(path: str) -> tuple[nn.Module, gym.vector.VectorEnv, Any]:
 
     Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
     """
-    ppo_gru.load_model(path)  # whichever script wrote it, this says what is wrong with a file that neither did
-    script = SCRIPTS[torch.load(path, map_location="cpu", weights_only=True)["script"]]
-    args, _ = script.load_model(path)
-    envs = script.make_envs(args, 1, "debug_rgb_array" if script.is_memory_gym(args.env_id) else "rgb_array")
-    agent = script.Agent(envs.single_observation_space, envs.single_action_space, args)
+    try:
+        script, (args, _) = ppo_gru, ppo_gru.load_model(path)
+    except ValueError:  # of the other script, or of none, which it says then
+        script, (args, _) = ppo_trxl, ppo_trxl.load_model(path)
+    envs = script.make_envs(args, 1, "debug_rgb_array")
+    _, infos = envs.reset(options=script.reset_options(args.env_id, args.env_options))
+    agent = script.make_agent(envs, infos, args, torch.device("cpu"))
     script.load_weights(agent, path)
-    return agent.eval(), envs, args
+    if not all(weight.isfinite().all() for weight in agent.parameters()):
+        raise ValueError(f"{path} holds weights that are no finite numbers: the training diverged")
+    return agent, envs, args
 
 
 def main(config: Config) -> str:
     """Play, write the page, and return one line that says how it went. Raises what `load` and `play` raise."""
     if get_plotlyjs is None:
         raise ImportError('enjoy.py needs plotly and pillow: pip install -e ".[enjoy]"')
-    if config.max_steps < 1:
-        raise ValueError(f"--max-steps is {config.max_steps}; it must be 1 or more")
+    if not 1 <= config.max_steps <= 100_000:
+        raise ValueError(f"--max-steps is {config.max_steps}; it must be from 1 to 100000")
     if config.seed is not None and config.seed < 0:
         raise ValueError(f"--seed is {config.seed}; it must be 0 or more")
     out = Path(config.out)
@@ -497,9 +523,9 @@ def summary(episode: Episode, args: Any, seed: int) -> dict[str, Any]:
     """Return what the page's head tells of the episode."""
     steps = len(episode.actions)
     facts = {"agent": kind(args), "seed": seed}
-    facts |= {"steps": steps, "return": f"{sum(episode.lines['reward']):.4g}"}
+    facts |= {"steps": steps, "return": f"{sum(episode.rewards):.4g}"}
     facts |= {name.replace("_", " "): f"{value:.4g}" for name, value in episode.final.items() if name not in KNOWN}
-    return facts if episode.final else facts | {"cut short": f"after {steps} steps"}
+    return facts if episode.finished else facts | {"cut short": f"after {steps} steps"}
 
 
 if __name__ == "__main__":
