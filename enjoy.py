@@ -315,10 +315,10 @@ const page = JSON.parse(document.getElementById("data").textContent);
 const find = selector => document.querySelector(selector);
 const INK = "#23282f", SOFT = "#6a7280", LINE = "#2d5d8c", ACCENT = "#c8553d", PALE = "#b9cbdc";
 const FONT = {family: "system-ui, sans-serif", size: 12, color: SOFT};
-const CALM = {displayModeBar: false, responsive: true};
+const CALM = {displayModeBar: false, responsive: true, doubleClick: "reset"};
 const AXIS = {zeroline: false, gridcolor: "#eef0f2", linecolor: "#cfd3d9", fixedrange: true, nticks: 4};
 const nth = (axis, i) => axis + (i ? i + 1 : "");  // what Plotly calls the i-th axis, from 0
-let now = 0, shown = 0, timer = null;
+let now = 0, shown = 0, pointing = false, timer = null;
 
 // Header.
 for (const [name, value] of Object.entries(page.facts)) {
@@ -381,7 +381,7 @@ for (let k = 0; look && k < look.blocks; k++) {
     error_y: {type: "data", symmetric: false, array: [], arrayminus: [], width: 0, thickness: 1.5, color: ACCENT}});
 }
 const unit = 1 / (rows.length - 0.24);  // a row and the room above it for its name; the first name is in the margin
-const layout = {height: 62 + (look ? 112 : 200) * rows.length, margin: {l: 58, r: 10, t: 22, b: 40}, font: FONT,
+const layout = {height: 62 + Math.max(112 * rows.length, 690), margin: {l: 58, r: 10, t: 22, b: 40}, font: FONT,
   showlegend: false, hovermode: "x", hoverdistance: -1, bargap: 0, annotations: [],
   xaxis: {...AXIS, fixedrange: false, range: [-0.5, page.steps - 0.5], nticks: 12, title: {text: "step", standoff: 6},
     anchor: nth("y", rows.length - 1)},
@@ -396,7 +396,9 @@ rows.forEach((name, row) => {
 Plotly.newPlot("curves", curves, layout, CALM);
 find("#curves").on("plotly_click", event => go(event.points[0].x));
 // Pointing at a score shows what was looked at.
-find("#curves").on("plotly_hover", ({points: [{curveNumber, x}]}) => { if (curveNumber >= firstBlock) show(x); });
+// Plotly tells of hovering after every change, too, and before the event comes here unless it is captured.
+find("#curves").addEventListener("mousemove", () => pointing = true, true);
+find("#curves").on("plotly_hover", ({points: [{curveNumber, x}]}) => pointing && curveNumber >= firstBlock && show(x));
 find("#curves").on("plotly_unhover", () => show(now));
 
 // The scores of a block at the current step: the steps looked at, oldest first.
@@ -437,6 +439,7 @@ function drawTruth() {
 // The player.
 function go(step) {
   now = Math.min(Math.max(step, 0), page.steps - 1);
+  pointing = false;
   show(now); drawBars(); drawCurves(); drawTruth();
   find("#slider").value = now;
 }

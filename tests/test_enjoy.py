@@ -16,6 +16,7 @@ import torch
 from PIL import Image
 from selenium import webdriver
 from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.actions.action_builder import ActionBuilder
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
@@ -62,12 +63,15 @@ def data_of(page):
     return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)[1])
 
 
+def picture(url):
+    """The pixels (h, w, 3) of a data URL."""
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB"))
+
+
 def frames_of(video):
     """The frames (T, h, w, 3) of a video on the page."""
-    sheets = [Image.open(io.BytesIO(base64.b64decode(sheet.split(",")[1]))) for sheet in video["sheets"]]
-    return np.concatenate([np.asarray(sheet.convert("RGB")) for sheet in sheets]).reshape(
-        -1, video["height"], video["width"], 3
-    )
+    shape = (-1, video["height"], video["width"], 3)
+    return np.concatenate([picture(sheet).reshape(shape) for sheet in video["sheets"]])
 
 
 # ---- what is recorded ----
@@ -81,8 +85,7 @@ def test_every_kind_of_agent(name, saved):
     steps = page["steps"]
     assert line.startswith(f"page.html: {steps} steps, return {page['facts']['return']}, ")
     assert page["facts"]["agent"] == ("GRU" if name == "CartPole" else name)
-    assert all(len(page[key]) == steps for key in ("actions",))
-    assert all(len(line) == steps for line in page["lines"].values())
+    assert all(len(each) == steps for each in (page["actions"], *page["lines"].values()))
     names = ["rendered frame" if name in ("GTrXL", "CartPole") else "agent's view"]
     names += ["ground truth"] * (name != "CartPole") + ["reconstruction"] * bool(args.reconstruction_coef)
     assert [video["name"] for video in page["videos"]] == names
@@ -168,5 +171,212 @@ def test_a_thousand_steps_stay_small(saved):
     options = '{"agent_health": 1000000, "steps_per_coin": 1000000}'
     window = {"trxl_memory_length": 256, "trxl_num_layers": 3, "reconstruction_coef": 0.1}
     saved(ppo_trxl, env_id="Endless-SearingSpotlights-v0", env_options=options, **window)
-    assert enjoy.main(enjoy.Config("model.pt", seed=3)).startswith("page.html: 1000 steps")
-    assert os.path.getsize("page.html") < 15e6
+    assert enjoy.main(enjoy.Config("model.pt", seed=3, max_steps=200)).startswith("page.html: 200 steps")
+    library, longest_look = len(enjoy.get_plotlyjs()), 3 * 256 * 2 * 4 / 3  # three blocks, two bytes, in base64
+    assert library + 5 * (os.path.getsize("page.html") - library) + 1000 * longest_look < 15e6
+
+
+# ---- in a browser ----
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """A headless Chromium that logs its console."""
+    program, driver = shutil.which("chromium") or shutil.which("google-chrome"), shutil.which("chromedriver")
+    if not program or not driver:
+        pytest.skip("no browser: apt-get install chromium chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = program
+    flags = "headless no-sandbox disable-gpu disable-quic no-first-run disable-background-networking"
+    flags += " disable-component-update disable-sync window-size=1400,1000"
+    for flag in (*flags.split(), f"user-data-dir={tmp_path_factory.mktemp('browser')}"):
+        options.add_argument(f"--{flag}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    browser = webdriver.Chrome(options, webdriver.ChromeService(driver))
+    yield browser
+    browser.quit()
+
+
+@pytest.fixture
+def watch(browser, saved):
+    """Open the page of a transformer's episode at a step; return what it holds, and its videos' frames.
+
+    In the end there is nothing in the browser's console, and the page has loaded nothing.
+    """
+
+    def open_page(step):
+        saved(ppo_trxl, env_id="MortarMayhem-Grid-v0", trxl_memory_length=128)
+        enjoy.main(enjoy.Config("model.pt", seed=3))
+        browser.get(f"file://{os.path.abspath('page.html')}#{step}")
+        with open("page.html") as file:
+            page = data_of(file.read())
+        return page, [frames_of(video) for video in page["videos"]]
+
+    yield open_page
+    assert browser.get_log("browser") == []
+    assert browser.execute_script("return performance.getEntriesByType('resource').length") == 0
+
+
+def step_of(browser):
+    return int(browser.find_element("tag name", "output").text.split()[1].strip(","))
+
+
+def check_step(browser, videos, step):
+    """The page says that it is at the step, and every video shows the frame of it, to the pixel."""
+    assert step_of(browser) == step
+    check_shown(browser, videos, step)
+
+
+def check_shown(browser, videos, step):
+    def is_shown(_):
+        urls = browser.execute_script("return [...document.querySelectorAll('canvas')].map(each => each.toDataURL())")
+        return all(np.array_equal(picture(url), video[step]) for url, video in zip(urls, videos, strict=True))
+
+    WebDriverWait(browser, 10).until(is_shown)
+
+
+def place(browser, selector, index):
+    """Where the index-th selected part of the page is in the window: left, top, width, height."""
+    script = "const box = document.querySelectorAll(arguments[0])[arguments[1]].getBoundingClientRect();"
+    return browser.execute_script(script + "return [box.x, box.y, box.width, box.height]", selector, index)
+
+
+def point(browser, x, y):
+    actions = ActionBuilder(browser)
+    actions.pointer_action.move_to_location(round(x), round(y))
+    actions.perform()
+
+
+def click(browser, x, y):
+    point(browser, x, y)
+    ActionChains(browser).click().perform()
+
+
+def press(browser, *keys):
+    ActionChains(browser).send_keys(*keys).perform()
+
+
+@pytest.mark.parametrize("line", [0, 1, 2])
+def test_click_on_a_line(line, browser, watch):
+    page, videos = watch(5)
+    check_step(browser, videos, 5)
+    x, y, width, height = place(browser, "#curves .scatterlayer .js-line", line)
+    for step in (31, 12):
+        click(browser, x + width * step / (page["steps"] - 1), y + height / 2)
+        check_step(browser, videos, step)
+
+
+@pytest.mark.parametrize("block", [0, 1])
+def test_click_on_an_attention_score(block, browser, watch):
+    page, videos = watch(40)
+    look = page["attention"]
+    scores = np.frombuffer(base64.b64decode(look["scores"]), "<u2").reshape(page["steps"], 2, -1)
+    best = np.argsort(-scores[40, block].astype(int))[:16] + 40 - look["items"]
+    for i in (0, 9):
+        x, y, width, height = place(browser, "#curves .scatterlayer .points .point", 16 * block + i)
+        point(browser, x + width / 2, y + height / 2)
+        check_shown(browser, videos, best[i])
+        point(browser, 0, 0)
+        check_step(browser, videos, 40)
+        click(browser, x + width / 2, y + height / 2)
+        check_step(browser, videos, best[i])
+        press(browser, Keys.HOME)
+        ActionChains(browser).key_down(Keys.SHIFT).send_keys(*[Keys.ARROW_RIGHT] * 4).key_up(Keys.SHIFT).perform()
+        check_step(browser, videos, 40)
+
+
+def test_keys(browser, watch):
+    page, videos = watch(0)
+    press(browser, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_LEFT)
+    check_step(browser, videos, 2)
+    press(browser, Keys.HOME, Keys.ARROW_LEFT)
+    check_step(browser, videos, 0)
+    press(browser, Keys.END, Keys.ARROW_RIGHT)
+    check_step(browser, videos, page["steps"] - 1)
+    press(browser, Keys.SPACE)  # plays, from the beginning as it is at the end
+    button = browser.find_element("id", "play")
+    assert button.text == "Pause"
+    WebDriverWait(browser, 10).until(lambda _: 3 <= step_of(browser) < page["steps"] - 1)
+    press(browser, Keys.SPACE)
+    assert button.text == "Play"
+    check_step(browser, videos, step_of(browser))
+    button.click()
+    press(browser, Keys.SPACE)  # pauses, and does not press the button again
+    assert button.text == "Play"
+
+
+def test_bars_and_numbers_are_those_of_the_step(browser, watch):
+    page, _ = watch(7)
+    texts = [each.text for each in browser.find_elements("css selector", "#bars .bartext")]
+    assert texts == [f"{each:.2f}" for each in page["branches"][0]["probabilities"][7]]
+    colors = browser.execute_script(
+        "return [...document.querySelectorAll('#bars .point path')].map(bar => bar.style.fill)"
+    )
+    assert [color != colors[page["actions"][7][0] - 1] for color in colors].count(True) == 1
+    row = browser.find_element("css selector", "#truth tr").text
+    assert row == " ".join(["true", *(f"{each:.3f}" for each in page["truth"][7])])
+
+
+def test_narrow_window(browser, watch):
+    watch(3)
+    browser.set_window_size(500, 900)
+    try:
+        fits = "return document.documentElement.scrollWidth <= innerWidth"
+        WebDriverWait(browser, 10).until(lambda _: browser.execute_script(fits))
+    finally:
+        browser.set_window_size(1400, 1000)
+
+
+# ---- bad input ----
+def test_bad_input_is_one_line(saved):
+    saved()
+    program = os.path.abspath(enjoy.__file__)
+    made = subprocess.run([sys.executable, program, "missing.pt"], capture_output=True, text=True)
+    assert (made.returncode, made.stdout) == (1, "")
+    assert made.stderr == "enjoy.py: there is no file missing.pt; --save-model writes model.pt to the run folder\n"
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"checkpoint": enjoy.__file__}, "enjoy.py is not a model that --save-model wrote"),
+        ({"seed": -1}, "--seed is -1; it must be 0 or more"),
+        ({"max_steps": 0}, "--max-steps is 0; it must be from 1 to 100000"),
+        ({"out": "nowhere/page.html"}, "there is no folder nowhere"),
+        ({"out": "."}, "directory"),
+    ],
+)
+def test_bad_input(config, message, saved):
+    saved()
+    with pytest.raises((ValueError, OSError), match=re.escape(message)):
+        enjoy.main(enjoy.Config(**{"checkpoint": "model.pt", **config}))
+    assert not os.path.exists("page.html")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"env_id": "CueRecall-v0"}, "CueRecall-v0 cannot be made: .*render_mode"),
+        ({"env_options": '{"agent_scal": 1}'}, "agent_scal.*agent_scale"),
+        ({"obs_type": "vector"}, "holds the weights of another network"),
+    ],
+)
+def test_checkpoint_that_cannot_play(change, message, saved):
+    args = saved()
+    model = torch.load("model.pt", weights_only=True)
+    torch.save({**model, "args": dataclasses.asdict(dataclasses.replace(args, **change))}, "model.pt")
+    with pytest.raises(ValueError, match=message):
+        enjoy.main(enjoy.Config("model.pt"))
+
+
+def test_diverged_weights(saved):
+    saved()
+    model = torch.load("model.pt", weights_only=True)
+    model["weights"]["heads.value.2.bias"].fill_(torch.nan)
+    torch.save(model, "model.pt")
+    with pytest.raises(ValueError, match="holds weights that are no finite numbers: the training diverged"):
+        enjoy.main(enjoy.Config("model.pt"))
+
+
+def test_missing_extra(monkeypatch):
+    monkeypatch.setattr(enjoy, "get_plotlyjs", None)
+    with pytest.raises(ImportError, match=re.escape('enjoy.py needs plotly and pillow: pip install -e ".[enjoy]"')):
+        enjoy.main(enjoy.Config("model.pt"))
