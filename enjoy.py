@@ -10,7 +10,6 @@ Shape letters: T steps of the episode, A action branches, K blocks, H heads, M i
 """
 
 import base64
-import html
 import io
 import json
 import math
@@ -37,7 +36,6 @@ except ImportError:  # main tells how to get them
 SHEET = 16  # frames in one picture: a neighbour costs few bytes, and a jump makes a browser decode one sheet only
 VIEW, RECONSTRUCTION = "agent's view", "reconstruction"
 LARGEST = 336  # pixels of a frame's longer side
-KNOWN = ("reward", "length")  # of a final info, told already
 FREE = {"horizontal": ["none", "left", "right"], "vertical": ["none", "up", "down"]}
 GRID = {"action": ["none", "turn left", "turn right", "forward"]}
 ENDLESS_PATH = {"action": ["none", "right", "up", "down"]}
@@ -186,12 +184,12 @@ def displayable(pixels: np.ndarray) -> np.ndarray:
 
 
 # ---- PAGE ----
-def page_data(episode: Episode, title: str, facts: dict[str, Any], env_id: str, fps: float) -> dict[str, Any]:
-    """Return all that the page shows, as JSON can hold it."""
+def page_data(episode: Episode, env_id: str, facts: dict[str, Any], fps: float) -> dict[str, Any]:
+    """Return all that the page shows, as JSON can hold it; facts, by name, stand in its head."""
     lines = {"state value": episode.values, "entropy": episode.entropies, "reward": episode.rewards}
     branches = zip(branch_names(env_id, episode.policy[0]).items(), zip(*episode.policy, strict=True), strict=True)
     return {
-        "title": title,
+        "title": env_id,
         "facts": facts,
         "steps": len(episode.actions),
         "fps": fps,
@@ -247,8 +245,7 @@ def packed(attention: list[np.ndarray]) -> dict[str, Any] | None:
 def page(data: dict[str, Any], plotly: str) -> str:
     """Fill the template with the data and the source of the plotting library."""
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")  # no name in it may end the script
-    title = html.escape(data["title"])
-    return TEMPLATE.replace("{{title}}", title).replace("{{data}}", text).replace("{{plotly}}", plotly)
+    return TEMPLATE.replace("{{title}}", data["title"]).replace("{{data}}", text).replace("{{plotly}}", plotly)
 
 
 TEMPLATE = """<!doctype html>
@@ -509,7 +506,7 @@ def main(config: Config) -> str:
     options = ppo_gru.reset_options(args.env_id, args.env_options)
     episode = play(agent, envs, seed, options, config.max_steps)
     facts = summary(episode, args, seed)
-    data = page_data(episode, args.env_id, facts, args.env_id, envs.metadata.get("render_fps", 25))
+    data = page_data(episode, args.env_id, facts, envs.metadata.get("render_fps", 25))
     out.write_text(page(data, get_plotlyjs()), encoding="utf-8")
     size = out.stat().st_size / 1e6
     return f"{out}: {facts['steps']} steps, return {facts['return']}, {size:.1f} MB"
@@ -527,7 +524,7 @@ def summary(episode: Episode, args: Any, seed: int) -> dict[str, Any]:
     steps = len(episode.actions)
     facts = {"agent": kind(args), "seed": seed}
     facts |= {"steps": steps, "return": f"{sum(episode.rewards):.4g}"}
-    facts |= {name.replace("_", " "): f"{value:.4g}" for name, value in episode.final.items() if name not in KNOWN}
+    facts |= {name.replace("_", " "): f"{value:.4g}" for name, value in episode.final.items() if name not in ("reward", "length")}
     return facts if episode.finished else facts | {"cut short": f"after {steps} steps"}
 
 

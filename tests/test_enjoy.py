@@ -103,7 +103,7 @@ def test_the_episode_is_the_agents(saved):
     saved(ppo_trxl, env_id="MortarMayhem-Grid-v0")
     agent, envs, _ = enjoy.load("model.pt")
     episode = enjoy.play(agent, envs, 3, None, 60)
-    page = enjoy.page_data(episode, "", {}, "MortarMayhem-Grid-v0", 25)
+    page = enjoy.page_data(episode, "MortarMayhem-Grid-v0", {}, 25)
     view, truth = map(frames_of, page["videos"])
     torch.manual_seed(3)
     obs, infos = envs.reset(seed=3)
@@ -161,10 +161,9 @@ def test_displayable():
 
 def test_text_in_the_data_cannot_end_the_script():
     episode = enjoy.Episode(policy=[[np.ones(1)]], actions=[[0]], values=[0.0], entropies=[0.0], rewards=[0.0])
-    page = enjoy.page(enjoy.page_data(episode, "</script><b>", {"a": "<!--"}, "CartPole-v1", 1), "")
+    page = enjoy.page(enjoy.page_data(episode, "CartPole-v1", {"</script>": "<!--"}, 1), "")
     assert page.count("</script>") == 3
-    assert "<title>&lt;/script&gt;&lt;b&gt;</title>" in page
-    assert data_of(page)["title"] == "</script><b>"
+    assert data_of(page)["facts"] == {"</script>": "<!--"}
 
 
 def test_a_thousand_steps_stay_small(saved):
