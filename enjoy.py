@@ -184,7 +184,7 @@ def displayable(pixels: np.ndarray) -> np.ndarray:
 
 
 # ---- PAGE ----
-def page_data(episode: Episode, env_id: str, facts: dict[str, Any], fps: float) -> dict[str, Any]:
+def page_data(episode: Episode, env_id: str, facts: dict[str, Any]) -> dict[str, Any]:
     """Return all that the page shows, as JSON can hold it; facts, by name, stand in its head."""
     lines = {"state value": episode.values, "entropy": episode.entropies, "reward": episode.rewards}
     branches = zip(branch_names(env_id, episode.policy[0]).items(), zip(*episode.policy, strict=True), strict=True)
@@ -192,7 +192,6 @@ def page_data(episode: Episode, env_id: str, facts: dict[str, Any], fps: float) 
         "title": env_id,
         "facts": facts,
         "steps": len(episode.actions),
-        "fps": fps,
         "videos": [video_data(name, video) for name, video in episode.videos.items()],
         "branches": [
             {"name": name, "actions": actions, "probabilities": rounded(probabilities)}
@@ -392,8 +391,7 @@ rows.forEach((name, row) => {
 });
 Plotly.newPlot("curves", curves, layout, CALM);
 find("#curves").on("plotly_click", event => go(event.points[0].x));
-// Pointing at a score shows what was looked at.
-// Plotly tells of hovering after every change, too, and before the event comes here unless it is captured.
+// Pointing at a score shows what was looked at. Plotly tells of it after every redrawing, too: that does not count.
 find("#curves").addEventListener("mousemove", () => pointing = true, true);
 find("#curves").on("plotly_hover", ({points: [{curveNumber, x}]}) => pointing && curveNumber >= firstBlock && show(x));
 find("#curves").on("plotly_unhover", () => show(now));
@@ -447,9 +445,9 @@ function play() {
   timer = setInterval(() => now < page.steps - 1 ? go(now + 1) : pause(), 1000 / find("select").value);
 }
 const toggle = () => timer ? pause() : play();
-for (const speed of [2, 5, 10, page.fps]) find("select").add(new Option(`${speed} steps/s`, speed));
+for (const speed of [2, 5, 10, 25]) find("select").add(new Option(`${speed} steps/s`, speed));
 find("select").selectedIndex = 1;
-find("select").onchange = () => { if (timer) { pause(); play(); } };
+find("select").onchange = event => { event.target.blur(); if (timer) { pause(); play(); } };
 find("#slider").max = page.steps - 1;
 find("#slider").oninput = event => go(Number(event.target.value));
 find("#play").onclick = toggle;
@@ -458,8 +456,10 @@ find("#forth").onclick = () => { pause(); go(now + 1); };
 find("#top-only").hidden = !look;
 find("#top-only input").onchange = drawCurves;
 find("#truth").hidden = !page.truth.length;
-document.onclick = () => document.activeElement.blur();  // so that the space bar does not press a button again
+// Without the focus, the space bar does not press the last button again. A list that is open would be shut.
+document.onclick = event => event.target.tagName === "SELECT" || document.activeElement.blur();
 document.onkeydown = event => {
+  if (event.altKey || event.ctrlKey || event.metaKey) return;
   const way = {ArrowLeft: -1, ArrowRight: 1}[event.key];
   if (way) { pause(); go(now + way * (event.shiftKey ? 10 : 1)); } else if (event.key === " ") toggle();
   else if (event.key === "Home") go(0); else if (event.key === "End") go(page.steps - 1); else return;
@@ -506,8 +506,7 @@ def main(config: Config) -> str:
     options = ppo_gru.reset_options(args.env_id, args.env_options)
     episode = play(agent, envs, seed, options, config.max_steps)
     facts = summary(episode, args, seed)
-    data = page_data(episode, args.env_id, facts, envs.metadata.get("render_fps", 25))
-    out.write_text(page(data, get_plotlyjs()), encoding="utf-8")
+    out.write_text(page(page_data(episode, args.env_id, facts), get_plotlyjs()), encoding="utf-8")
     size = out.stat().st_size / 1e6
     return f"{out}: {facts['steps']} steps, return {facts['return']}, {size:.1f} MB"
 
@@ -524,7 +523,11 @@ def summary(episode: Episode, args: Any, seed: int) -> dict[str, Any]:
     steps = len(episode.actions)
     facts = {"agent": kind(args), "seed": seed}
     facts |= {"steps": steps, "return": f"{sum(episode.rewards):.4g}"}
-    facts |= {name.replace("_", " "): f"{value:.4g}" for name, value in episode.final.items() if name not in ("reward", "length")}
+    facts |= {
+        name.replace("_", " "): f"{value:.4g}"
+        for name, value in episode.final.items()
+        if name not in ("reward", "length")
+    }
     return facts if episode.finished else facts | {"cut short": f"after {steps} steps"}
 
 
