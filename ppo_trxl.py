@@ -61,6 +61,8 @@ class Args:
     """ask cuDNN for deterministic algorithms"""
     cuda: bool = True
     """train on the GPU when there is one"""
+    amp: bool = False
+    """compute the networks in bfloat16, twice as fast on processors that have it; losses stay in float32"""
     track: bool = False
     """log to Weights and Biases too (needs the extra `track`)"""
     wandb_project_name: str = "memory-gym-baselines"
@@ -510,7 +512,7 @@ class Encoder(nn.Module):
         if self.vectors:
             features.append(F.relu(self.mlp(torch.cat([obs[name].float() for name in self.vectors], -1))))
         features = torch.cat(features, -1) if len(features) > 1 else features[0]
-        return F.relu(self.embedding(features))
+        return F.relu(self.embedding(features)).float()
 
 
 class Decoder(nn.Sequential):
@@ -558,9 +560,9 @@ class Heads(nn.Module):
     def forward(self, x: Tensor) -> tuple[list[Categorical], Tensor, Tensor]:
         """Map what the memory says, (B, D), to a distribution of each branch, values (B,) and features (B, F)."""
         features = F.relu(self.trunk(x))
-        logits = self.policy(features).split(self.branches, -1)
+        logits = self.policy(features).float().split(self.branches, -1)
         policy = [Categorical(logits=part, validate_args=False) for part in logits]
-        return policy, self.value(features)[:, 0], features
+        return policy, self.value(features)[:, 0].float(), features
 
 
 def head(size: int, outputs: int, gain: float) -> nn.Sequential:
@@ -653,7 +655,8 @@ class Gate(nn.Module):
         """Merge x and y, (S, L, D) each."""
         (reset_y, update_y, new_y), (reset_x, update_x) = self.from_y(y).chunk(3, -1), self.from_x(x).chunk(2, -1)
         reset, update = torch.sigmoid(reset_y + reset_x), torch.sigmoid(update_y + update_x - self.bias)
-        return torch.lerp(x, torch.tanh(new_y + self.candidate(reset * x)), update)
+        new = torch.tanh(new_y + self.candidate(reset * x))
+        return torch.lerp(x, new.to(x.dtype), update.to(x.dtype))
 
 
 class Block(nn.Module):
@@ -714,6 +717,7 @@ class Memory(nn.Module):
         self.width, self.window = args.trxl_dim, args.trxl_memory_length
         self.segment_length, self.query_position = args.trxl_segment_length, args.trxl_query_position
         self.encoding = args.trxl_positional_encoding
+        self.cache_dtype = torch.bfloat16 if args.amp else torch.float32  # as the layers deliver keys and values
         self.blocks = nn.ModuleList(Block(args) for _ in range(args.trxl_num_layers))
         for block in self.blocks:
             block_init(block, args.trxl_init, args.trxl_num_layers)
@@ -724,7 +728,8 @@ class Memory(nn.Module):
         """Return the live memory of fresh episodes, with room for a rollout of num_steps."""
         cache = (len(self.blocks), lanes, self.window + num_steps + 1, self.width)
         steps = torch.zeros(lanes, dtype=torch.int64, device=device)
-        return Live(self.window, steps, torch.zeros(cache, device=device), torch.zeros(cache, device=device))
+        keys, values = (torch.zeros(cache, dtype=self.cache_dtype, device=device) for _ in range(2))
+        return Live(self.window, steps, keys, values)
 
     def storage(self, num_steps: int, lanes: int, device: torch.device) -> Timeline:
         """Return room for what a rollout stores."""
@@ -757,7 +762,7 @@ class Memory(nn.Module):
         """Take one step of all lanes: x (N, D) to (N, D), the new live memory, and what to store of this step.
 
         Writes the cache's row of this step, which no query of this step sees: to take the step again changes nothing.
-        Raises ValueError if an episode outlasts a learned encoding's table.
+        Raises MemoryLimit if an episode outlasts a learned encoding's table.
         """
         self.check_length(live.steps)
         rows, age, seen = self.look_back(live)
@@ -838,9 +843,9 @@ class Memory(nn.Module):
         return self.table[steps] if self.encoding == "learned" else sinusoid(steps, self.width).to(dtype)
 
     def check_length(self, steps: Tensor) -> None:
-        """Raise ValueError if a lane's episode outlasts the learned encoding's table."""
+        """Raise MemoryLimit if a lane's episode outlasts the learned encoding's table."""
         if self.encoding == "learned" and int(steps.max()) >= len(self.table):
-            raise ValueError(
+            raise MemoryLimit(
                 f"--trxl-pe-length is {len(self.table)}, but an episode is longer; make it the longest episode's "
                 "length, or use --trxl-positional-encoding absolute or relative, which have no such limit"
             )
@@ -895,6 +900,10 @@ class Agent(nn.Module):
     def evaluate(self, obs: dict[str, Tensor], pieces: Pieces, stored: Any) -> tuple[list[Categorical], Tensor, Tensor]:
         """Recompute the distributions, values (R,) and features (R, F) of the pieces' steps, in the pieces' order."""
         return self.heads(self.memory.unroll(self.encoder(obs), pieces, stored))
+
+
+class MemoryLimit(ValueError):
+    """A memory cannot hold what it is given; says which flag helps. Raised by `Memory.step`."""
 
 
 def make_agent(envs: gym.vector.VectorEnv, infos: dict, args: Args, device: torch.device) -> Agent:
@@ -1004,6 +1013,11 @@ def make_rollout(agent: Agent, play: Play, num_steps: int, device: torch.device)
     )
 
 
+def autocast(args: Args, device: torch.device) -> torch.autocast:
+    """Return the context in which the networks compute in bfloat16 with --amp; it keeps the weights' casts."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=args.amp)
+
+
 @torch.no_grad()
 def collect(
     agent: Agent, envs: gym.vector.VectorEnv, play: Play, rollout: Rollout, args: Args, recorder: LaneRecorder | None
@@ -1015,38 +1029,49 @@ def collect(
     """
     device, episodes = rollout.values.device, defaultdict(list)
     rollout.truncation_values.zero_()
-    play.live = agent.memory.refresh(play.live, rollout.memory)
-    for t in range(args.num_steps):
-        for name, part in play.obs.items():
-            rollout.obs[name][t] = part  # the first and only copy: env to device, dtype kept
-        if rollout.ground_truth is not None:
-            rollout.ground_truth[t] = play.ground_truth
-        obs = {name: part[t] for name, part in rollout.obs.items()}
-        policy, rollout.values[t], live, stored = agent.act(obs, play.live)
-        agent.memory.store(rollout.memory, t, stored)
-        actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
-        rollout.actions[t], rollout.log_probs[t] = actions, log_probs_of(policy, actions)
-        if recorder is not None:
-            recorder.capture()
+    with autocast(args, device):
+        play.live = agent.memory.refresh(play.live, rollout.memory)
+        for t in range(args.num_steps):
+            actions, live = decide(agent, play, rollout, t)
+            if recorder is not None:
+                recorder.capture()
 
-        obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
-        play.obs = as_tensors(obs)
-        if rollout.ground_truth is not None:
-            play.ground_truth = ground_truth_of(infos)
-        rollout.rewards[t] = torch.as_tensor(rewards)
-        rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
-        if args.bootstrap_truncated and truncated.any():
-            final = on_device(final_observations(play.obs, infos, truncated), device)
-            value = agent.act(final, live)[1]  # from the memory as it was before the reset
-            rollout.truncation_values[t] = value * rollout.truncated[t]
+            obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
+            play.obs = as_tensors(obs)
+            if rollout.ground_truth is not None:
+                play.ground_truth = ground_truth_of(infos)
+            rollout.rewards[t] = torch.as_tensor(rewards)
+            rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
+            if args.bootstrap_truncated and truncated.any():
+                final = on_device(final_observations(play.obs, infos, truncated), device)
+                value = agent.act(final, live)[1]  # from the memory as it was before the reset
+                rollout.truncation_values[t] = value * rollout.truncated[t]
 
-        done = terminated | truncated
-        play.live = agent.memory.reset(live, torch.as_tensor(done, device=device))
-        note_episodes(play, rewards, done, infos, episodes)
-        if recorder is not None and done[0]:
-            recorder.end_episode()
-    _, last_value, _, _ = agent.act(on_device(play.obs, device), play.live)
+            done = terminated | truncated
+            play.live = agent.memory.reset(live, torch.as_tensor(done, device=device))
+            note_episodes(play, rewards, done, infos, episodes)
+            if recorder is not None and done[0]:
+                recorder.end_episode()
+        _, last_value, _, _ = agent.act(on_device(play.obs, device), play.live)
     return last_value, episodes
+
+
+def decide(agent: Agent, play: Play, rollout: Rollout, t: int) -> tuple[Tensor, Any]:
+    """Choose the lanes' actions (N, A) of step t, and put away all that the choice is learned from.
+
+    Returns the new live memory too, as it is before the step may end episodes.
+    """
+    for name, part in play.obs.items():
+        rollout.obs[name][t] = part  # the first and only copy: env to device, dtype kept
+    if rollout.ground_truth is not None:
+        rollout.ground_truth[t] = play.ground_truth
+    policy, rollout.values[t], live, stored = agent.act(
+        {name: part[t] for name, part in rollout.obs.items()}, play.live
+    )
+    agent.memory.store(rollout.memory, t, stored)
+    actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
+    rollout.actions[t], rollout.log_probs[t] = actions, log_probs_of(policy, actions)
+    return actions, live
 
 
 def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
@@ -1101,7 +1126,8 @@ def minibatch_loss(
         return stored.flatten(0, 1).index_select(0, steps)
 
     obs = {name: take(part) for name, part in rollout.obs.items()}
-    policy, values, features = agent.evaluate(obs, pieces, rollout.memory)
+    with autocast(args, steps.device):
+        policy, values, features = agent.evaluate(obs, pieces, rollout.memory)
     log_ratio = log_probs_of(policy, take(rollout.actions)) - take(rollout.log_probs)  # (R, A)
     entropy = torch.stack([branch.entropy() for branch in policy], -1).sum(-1).mean()
     advantages, returns = map(take, targets)
@@ -1113,10 +1139,12 @@ def minibatch_loss(
     logs = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, **policy_numbers(log_ratio, args)}
     if agent.decoder is not None:
         pixels = next(obs[name] for name in agent.encoder.pixels)
-        logs["reconstruction_loss"] = reconstruction_loss(agent.decoder(features), pixels)
+        with autocast(args, steps.device):
+            drawn = agent.decoder(features)
+        logs["reconstruction_loss"] = reconstruction_loss(drawn.float(), pixels)
         loss = loss + args.reconstruction_coef * logs["reconstruction_loss"]
     if agent.estimator is not None:
-        estimate = agent.estimator(features.detach() if args.ground_truth_detach else features)
+        estimate = agent.estimator((features.detach() if args.ground_truth_detach else features).float())
         logs["ground_truth_loss"] = F.mse_loss(estimate, take(rollout.ground_truth))  # (5.6)
         loss = loss + args.ground_truth_coef * logs["ground_truth_loss"]
     logs["loss"] = loss
@@ -1193,8 +1221,10 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
     found = {name: np.zeros(len(levels)) for name in ("return", "length", "finished")}
     for t in range(args.eval_max_steps):
         if t % memory_steps == 0:
-            live = agent.memory.refresh(live, stored)
-        policy, _, live, item = agent.act(on_device(as_tensors(obs), device), live)
+            with autocast(args, device):
+                live = agent.memory.refresh(live, stored)
+        with autocast(args, device):
+            policy, _, live, item = agent.act(on_device(as_tensors(obs), device), live)
         agent.memory.store(stored, t % memory_steps, item)
         actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
         obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
@@ -1306,37 +1336,47 @@ def start_tracking(args: Args, name: str) -> None:
 
 
 def train(args: Args, run: Run) -> str:
-    """Train for --total-timesteps, rounded down to whole iterations, or until Ctrl-C; return the run folder."""
+    """Train for --total-timesteps, rounded down to whole iterations, or until Ctrl-C; return the run folder.
+
+    Whatever ends it, what was learned is kept. Raises MemoryLimit.
+    """
     recent = {"return": deque(maxlen=100), "length": deque(maxlen=100)}
     batch_size = args.num_envs * args.num_steps
-    start = time.perf_counter()
-    bar = tqdm(total=args.total_timesteps // batch_size * batch_size, unit=" steps", unit_scale=True)
-    with bar, contextlib.suppress(KeyboardInterrupt):  # Ctrl-C ends the training early and keeps what was learned
-        for step in range(0, bar.total, batch_size):
-            lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
-            ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
-            run.optimizer.param_groups[0]["lr"] = lr
-            last_value, episodes = collect(run.agent, run.envs, run.play, run.rollout, args, run.recorder)
-            scalars = update(run.agent, run.optimizer, run.rollout, last_value, ent_coef, args)
-
-            bar.update(batch_size)
-            speed = bar.n / (time.perf_counter() - start)
-            scalars |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef, "charts/SPS": speed}
-            scalars |= {name: float(np.mean(values)) for name, values in episodes.items()}
-            if run.eval_envs is not None and (bar.n // batch_size % args.eval_interval == 0 or bar.n == bar.total):
-                scalars |= evaluation_scalars(run, args)
-            for name, value in scalars.items():
-                run.writer.add_scalar(name, value, bar.n)
-            for name, window in recent.items():
-                window.extend(episodes.get(f"charts/episodic_{name}", []))
-            shown = {name: f"{np.mean(window):.2f}" for name, window in recent.items() if window}
-            bar.set_postfix({**shown, "SPS": f"{speed:.0f}"})
-    if args.save_model:
-        save_model(run.agent, args, os.path.join(run.folder, "model.pt"))
-    run.writer.close()
-    for envs in filter(None, (run.envs, run.eval_envs)):
-        envs.close()
+    iterations, start = args.total_timesteps // batch_size, time.perf_counter()
+    bar = tqdm(total=iterations * batch_size, unit=" steps", unit_scale=True)
+    try:
+        with bar, contextlib.suppress(KeyboardInterrupt):
+            for iteration in range(1, iterations + 1):
+                scalars, episodes = iterate(args, run, (iteration - 1) * batch_size)
+                if run.eval_envs is not None and (iteration % args.eval_interval == 0 or iteration == iterations):
+                    scalars |= evaluation_scalars(run, args)
+                step = iteration * batch_size
+                scalars["charts/SPS"] = step / (time.perf_counter() - start)
+                for name, value in scalars.items():
+                    run.writer.add_scalar(name, value, step)
+                for name, window in recent.items():
+                    window.extend(episodes.get(f"charts/episodic_{name}", []))
+                shown = {name: f"{np.mean(window):.2f}" for name, window in recent.items() if window}
+                bar.set_postfix({**shown, "SPS": f"{scalars['charts/SPS']:.0f}"}, refresh=False)
+                bar.update(batch_size)
+    finally:
+        if args.save_model:
+            save_model(run.agent, args, os.path.join(run.folder, "model.pt"))
+        run.writer.close()
+        for envs in filter(None, (run.envs, run.eval_envs)):
+            envs.close()
     return run.folder
+
+
+def iterate(args: Args, run: Run, step: int) -> tuple[dict[str, float], dict[str, list[float]]]:
+    """Play a rollout from this step of the training on, learn from it; return what to log, and the ended episodes."""
+    lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
+    ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
+    run.optimizer.param_groups[0]["lr"] = lr
+    last_value, episodes = collect(run.agent, run.envs, run.play, run.rollout, args, run.recorder)
+    scalars = update(run.agent, run.optimizer, run.rollout, last_value, ent_coef, args)
+    scalars |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
+    return scalars | {name: float(np.mean(values)) for name, values in episodes.items()}, episodes
 
 
 def evaluation_scalars(run: Run, args: Args) -> dict[str, float]:
@@ -1349,8 +1389,13 @@ def evaluation_scalars(run: Run, args: Args) -> dict[str, float]:
 
 
 def main(args: Args) -> str:
-    """Train an agent as the arguments say; return the run folder. Raises what `setup` raises."""
+    """Train an agent as the arguments say; return the run folder. Raises what `setup` and `train` raise."""
     return train(args, setup(args))
+
+
+def one_line(error: Exception) -> str:
+    """Return what to tell the user of an error."""
+    return f"{script_name()}.py: {' '.join(str(error).split())}"
 
 
 if __name__ == "__main__":
@@ -1358,5 +1403,8 @@ if __name__ == "__main__":
     try:
         run = setup(args)
     except (ValueError, OSError, ImportError, gym.error.Error) as error:
-        sys.exit(f"{os.path.basename(__file__)}: {' '.join(str(error).split())}")
-    train(args, run)
+        sys.exit(one_line(error))
+    try:
+        train(args, run)
+    except MemoryLimit as error:
+        sys.exit(one_line(error))

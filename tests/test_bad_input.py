@@ -149,3 +149,16 @@ def test_missing_extras(tiny, monkeypatch):
     assert setup_error(tiny(capture_video=True)) == message
     monkeypatch.setitem(sys.modules, "wandb", None)
     assert setup_error(tiny(track=True)) == '--track needs wandb: pip install -e ".[track]"'
+
+
+def test_an_episode_that_outlasts_a_learned_encoding(tmp_path):
+    """One line, and what was learned is kept."""
+    flags = "--env-id MysteryPath-Grid-v0 --obs-type vector --trxl-positional-encoding learned --trxl-pe-length 40"
+    sizes = "--trxl-dim 8 --trxl-num-heads 1 --num-envs 2 --num-steps 32 --num-minibatches 2 --total-timesteps 640"
+    command = [sys.executable, ppo_trxl.__file__, *flags.split(), *sizes.split(), "--no-cuda", "--save-model"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("ppo_trxl.py: --trxl-pe-length is 40, but an episode is longer; make it"), done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(list(tmp_path.glob("runs/*/model.pt"))) == 1

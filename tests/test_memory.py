@@ -51,6 +51,15 @@ def test_ratio_is_one_for_every_sample(played, env_id, memory):
         assert not rollout.terminated[-1].all()
 
 
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_ratio_is_nearly_one_in_bfloat16(played, memory):
+    args, run, *_ = played(iterations=3, weights_scale=3.0, env_id="MortarMayhemB-Grid-v0", amp=True, **memory)
+    with ppo_gru.autocast(args, torch.device("cpu")):
+        _, ratio, values = recompute(run)
+    assert (ratio - 1).abs().max() < 5e-2
+    assert values.dtype == run.rollout.log_probs.dtype == torch.float32
+
+
 @pytest.mark.parametrize("memory", MEMORIES[:-1])
 def test_ratio_error_sees_a_broken_memory(played, memory):
     """Guards the guard: with what the memory stored lost, the ratios are off."""
