@@ -456,7 +456,7 @@ find("#forth").onclick = () => { pause(); go(now + 1); };
 find("#top-only").hidden = !look;
 find("#top-only input").onchange = drawCurves;
 find("#truth").hidden = !page.truth.length;
-// Without the focus, the space bar does not press the last button again. A list that is open would be shut.
+// A focused button is pressed by the space bar too, in some browsers whatever onkeydown says. An open list needs focus.
 document.onclick = event => event.target.tagName === "SELECT" || document.activeElement.blur();
 document.onkeydown = event => {
   if (event.altKey || event.ctrlKey || event.metaKey) return;

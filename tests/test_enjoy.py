@@ -298,6 +298,7 @@ def test_keys(browser, watch):
     assert button.text == "Play"
     check_step(browser, videos, step_of(browser))
     button.click()
+    assert browser.switch_to.active_element.tag_name == "body"
     press(browser, Keys.SPACE)  # pauses, and does not press the button again
     assert button.text == "Play"
     Select(browser.find_element("tag name", "select")).select_by_value("25")
@@ -315,7 +316,8 @@ def test_bars_and_numbers_are_those_of_the_step(browser, watch):
     colors = browser.execute_script(
         "return [...document.querySelectorAll('#bars .point path')].map(bar => bar.style.fill)"
     )
-    assert [color != colors[page["actions"][7][0] - 1] for color in colors].count(True) == 1
+    red, blue = "rgb(200, 85, 61)", "rgb(185, 203, 220)"
+    assert colors == [red if action == page["actions"][7][0] else blue for action in range(4)]
     row = browser.find_element("css selector", "#truth tr").text
     assert row == " ".join(["true", *(f"{each:.3f}" for each in page["truth"][7])])
 
