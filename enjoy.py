@@ -349,7 +349,7 @@ function show(step) {
 // Bars: one group a branch, the chosen action in another colour.
 const bars = page.branches.map((branch, i) => ({type: "bar", x: branch.actions.map(name => name.replace(" ", "<br>")),
   y: branch.probabilities[0], xaxis: nth("x", i), cliponaxis: false, textposition: "outside", hoverinfo: "skip"}));
-const barsLayout = {height: 190, margin: {l: 34, r: 4, t: 14, b: 44}, font: FONT, showlegend: false,
+const barsLayout = {height: 196, margin: {l: 34, r: 4, t: 20, b: 44}, font: FONT, showlegend: false,
   yaxis: {...AXIS, range: [0, 1]}};
 page.branches.forEach((branch, i, {length}) => barsLayout[nth("xaxis", i)] = {type: "category", fixedrange: true,
   tickangle: 0, domain: [(i + (i && 0.06)) / length, (i + 1) / length], title: {text: length > 1 ? branch.name : ""}});
