@@ -429,6 +429,10 @@ class Pieces:
         within = torch.arange(int(self.length.sum())) - start.repeat_interleave(self.length)
         return self.first.repeat_interleave(self.length) + within * self.lanes
 
+    def slots(self) -> Tensor:
+        """Return where the steps (R,) lie among the S x L places of the pieces, each padded to the longest."""
+        return (torch.arange(int(self.length.max())) < self.length[:, None]).flatten().nonzero()[:, 0]
+
     def minibatches(self, count: int) -> Iterator["Pieces"]:
         """Shuffle the pieces and deal them, whole, into count minibatches of nearly the same number of steps."""
         order = torch.randperm(len(self.first))
@@ -666,7 +670,7 @@ class Memory(nn.Module):
 
     def reset(self, live: Tensor, done: Tensor) -> Tensor:
         """Forget the lanes whose episode ended, where done (N,) is true."""
-        return live.masked_fill(done[:, None, None], 0.0)
+        return live.masked_fill(done[:, None, None].to(live.device), 0.0)
 
     def cut(self, done: Tensor) -> Pieces:
         """Cut a rollout, whose episodes end where done (T, N) is true, into the pieces that minibatches are made of."""
@@ -686,8 +690,7 @@ class Memory(nn.Module):
         padded = pad_sequence(x.split(pieces.length.tolist()), batch_first=True)  # (S, L, D)
         y, _ = self.recur(padded, live)
         # The padding ends here: what follows, the losses' means (5.8) included, sees real steps only.
-        real = torch.arange(padded.shape[1]) < pieces.length[:, None]  # (S, L)
-        return y[real.to(x.device)]
+        return y.flatten(0, 1).index_select(0, pieces.slots().to(x.device))
 
     def recur(self, x: Tensor, live: Tensor) -> tuple[Tensor, Tensor]:
         """Run the recurrent layers over x (S, L, D) from the live memory (S, P, D); return both anew."""
@@ -895,7 +898,7 @@ def collect(
                 rollout.truncation_values[t] = value * rollout.truncated[t]
 
             done = terminated | truncated
-            play.live = agent.memory.reset(live, torch.as_tensor(done, device=device))
+            play.live = agent.memory.reset(live, torch.as_tensor(done))
             note_episodes(play, rewards, done, infos, episodes)
             if recorder is not None and done[0]:
                 recorder.end_episode()
@@ -1076,7 +1079,7 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
         actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
         obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
         done = terminated | truncated
-        live = agent.memory.reset(live, torch.as_tensor(done, device=device))
+        live = agent.memory.reset(live, torch.as_tensor(done))
         found["return"] += rewards * playing
         found["length"] += playing
         for name, values in final_numbers(infos, done & playing):
@@ -1117,6 +1120,8 @@ def setup(args: Args) -> Run:
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
     device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")  # TF32
     options = reset_options(args.env_id, args.env_options)
     envs = make_envs(args, args.num_envs, "debug_rgb_array" if args.capture_video else None)
     if envs.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:

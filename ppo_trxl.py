@@ -453,6 +453,10 @@ class Pieces:
         within = torch.arange(int(self.length.sum())) - start.repeat_interleave(self.length)
         return self.first.repeat_interleave(self.length) + within * self.lanes
 
+    def slots(self) -> Tensor:
+        """Return where the steps (R,) lie among the S x L places of the pieces, each padded to the longest."""
+        return (torch.arange(int(self.length.max())) < self.length[:, None]).flatten().nonzero()[:, 0]
+
     def minibatches(self, count: int) -> Iterator["Pieces"]:
         """Shuffle the pieces and deal them, whole, into count minibatches of nearly the same number of steps."""
         order = torch.randperm(len(self.first))
@@ -635,7 +639,7 @@ class Attention(nn.Module):
         if not self.relative:
             return self.split(self.query(x)), mask, blind
         query = self.split(self.query(x + self.content_bias))
-        ages = torch.arange(1, int(age.max()) + 1, device=x.device)  # (A,)
+        ages = torch.arange(1, age.shape[1] + 1, device=x.device)  # (A,), up to the last query's of the first item
         encoded = self.split(self.key(sinusoid(ages, x.shape[-1]).to(x.dtype))[None])  # (1, H, A, D / H)
         by_age = self.split(self.query(x + self.position_bias)) @ encoded.transpose(2, 3)  # (S, H, L, A)
         at = (age.clamp(min=1) - 1).expand(*by_age.shape[:3], -1)  # (S, H, L, M)
@@ -698,7 +702,7 @@ class Live:
     """The live memory of N lanes, a cache. Its rows are those of the rollout's timeline, and one more."""
 
     now: int  # the row of the step to come
-    steps: Tensor  # (N,) which step of its episode that is
+    steps: Tensor  # (N,) which step of its episode that is; on the CPU, as shapes depend on it
     keys: Tensor  # (K, N, W + T + 1, D) made of each block's past inputs
     values: Tensor  # (K, N, W + T + 1, D)
 
@@ -708,7 +712,7 @@ class Timeline:
     """What a rollout stores: row W + t is its step t, and the W rows before are the steps before it."""
 
     items: Tensor  # (W + T, N, K, D) the input of every block, detached
-    steps: Tensor  # (W + T, N) which step of its episode that was
+    steps: Tensor  # (W + T, N) which step of its episode that was; on the CPU
 
 
 class Memory(nn.Module):
@@ -736,7 +740,7 @@ class Memory(nn.Module):
     def initial(self, lanes: int, device: torch.device, num_steps: int) -> Live:
         """Return the live memory of fresh episodes, with room for a rollout of num_steps."""
         cache = (len(self.blocks), lanes, self.window + num_steps + 1, self.width)
-        steps = torch.zeros(lanes, dtype=torch.int64, device=device)
+        steps = torch.zeros(lanes, dtype=torch.int64)
         keys, values = (torch.zeros(cache, dtype=self.cache_dtype, device=device) for _ in range(2))
         return Live(self.window, steps, keys, values)
 
@@ -744,7 +748,7 @@ class Memory(nn.Module):
         """Return room for what a rollout stores."""
         shape = (self.window + num_steps, lanes)
         items = torch.zeros(*shape, len(self.blocks), self.width, device=device)
-        return Timeline(items, torch.zeros(shape, dtype=torch.int64, device=device))
+        return Timeline(items, torch.zeros(shape, dtype=torch.int64))
 
     def store(self, stored: Timeline, t: int, item: tuple[Tensor, Tensor]) -> None:
         """Put away what step t of the rollout has to be remembered for."""
@@ -761,7 +765,7 @@ class Memory(nn.Module):
         rows, _, seen = self.look_back(live)
         seen = seen[:, 0].T  # (M, N)
         items = stored.items[rows].masked_fill(~seen[..., None, None], 0.0)  # (M, N, K, D)
-        position = self.position(stored.steps[rows].where(seen, 0), items.dtype)  # (M, N, D)
+        position = self.position(stored.steps[rows].to(items.device).where(seen, 0), items.dtype)  # (M, N, D)
         for k, block in enumerate(self.blocks):
             keys, values = block.keys_values(items[:, :, k] + position)
             live.keys[k][:, rows], live.values[k][:, rows] = keys.transpose(0, 1), values.transpose(0, 1)
@@ -775,14 +779,15 @@ class Memory(nn.Module):
         """
         self.check_length(live.steps)
         rows, age, seen = self.look_back(live)
-        position = self.position(live.steps, x.dtype)  # (N, D)
+        steps = live.steps.to(x.device)
+        position = self.position(steps, x.dtype)  # (N, D)
         inputs = []
         x = x[:, None]  # (N, 1, D)
         for k, block in enumerate(self.blocks):
             inputs.append(x[:, 0])
             memory = live.keys[k][:, rows], live.values[k][:, rows]  # (N, M, D) each
             live.keys[k][:, live.now], live.values[k][:, live.now] = block.keys_values(x[:, 0] + position)
-            x = block(x, self.query_encoding(live.steps[:, None], x.dtype) if k == 0 else 0.0, memory, age, seen)
+            x = block(x, self.query_encoding(steps[:, None], x.dtype) if k == 0 else 0.0, memory, age, seen)
         new_live = Live(live.now + 1, live.steps + 1, live.keys, live.values)
         return x[:, 0], new_live, (torch.stack(inputs, 1), live.steps)
 
@@ -791,7 +796,7 @@ class Memory(nn.Module):
         rows, age, seen = self.look_back(live)
         x, found = x[:, None], []  # (N, 1, D)
         for k, block in enumerate(self.blocks):
-            position = self.query_encoding(live.steps[:, None], x.dtype) if k == 0 else 0.0
+            position = self.query_encoding(live.steps[:, None].to(x.device), x.dtype) if k == 0 else 0.0
             memory = live.keys[k][:, rows], live.values[k][:, rows]
             found.append(block.attention.weights(block.norm_query(x + position), memory[0], age, seen)[:, :, 0])
             x = block(x, position, memory, age, seen)
@@ -800,16 +805,17 @@ class Memory(nn.Module):
     def look_back(self, live: Live) -> tuple[slice, Tensor, Tensor]:
         """Return the cache's rows that a step may see, their ages (1, M), and which of them it sees (N, 1, M)."""
         longest = min(max(int(live.steps.max()), 1), self.window)  # no further back than the oldest episode
-        rows = slice(live.now - longest, live.now)
-        age = torch.arange(longest, 0, -1, device=live.steps.device)[None]  # (1, M)
-        return rows, age, visible(age, live.steps[:, None], self.window)[:, None]
+        rows, device = slice(live.now - longest, live.now), live.keys.device
+        age = torch.arange(longest, 0, -1, device=device)[None]  # (1, M)
+        return rows, age, visible(age, live.steps[:, None].to(device), self.window)[:, None]
 
     def reset(self, live: Live, done: Tensor) -> Live:
         """Forget the lanes whose episode ended, where done (N,) is true."""
         rows, _, _ = self.look_back(live)
+        lanes = done.nonzero()[:, 0].to(live.keys.device)
         for cache in (live.keys, live.values):
             # Nothing sees these any more. As zeros, not even a NaN among them could pass through a weight of zero.
-            cache[:, done.nonzero()[:, 0], rows] = 0.0
+            cache[:, lanes, rows] = 0.0
         return Live(live.now, live.steps.masked_fill(done, 0), live.keys, live.values)
 
     def cut(self, done: Tensor) -> Pieces:
@@ -819,25 +825,25 @@ class Memory(nn.Module):
 
     def unroll(self, x: Tensor, pieces: Pieces, stored: Timeline) -> Tensor:
         """Run whole segments at once: x (R, D) to (R, D), with the items of the W steps before each segment."""
-        first, length = pieces.first.to(x.device), pieces.length.to(x.device)
-        row, lane = self.window + first[:, None] // pieces.lanes, first[:, None] % pieces.lanes  # (S, 1) each
+        row, lane = self.window + pieces.first[:, None] // pieces.lanes, pieces.first[:, None] % pieces.lanes  # (S, 1)
         x = pad_sequence(x.split(pieces.length.tolist()), batch_first=True)  # (S, L, D)
-        at = torch.arange(x.shape[1], device=x.device)  # (L,)
-        real = at < length[:, None]  # (S, L)
-        steps = stored.steps[(row + at).clamp(max=len(stored.steps) - 1), lane].where(real, 0)
+        at = torch.arange(x.shape[1])  # (L,)
+        steps = stored.steps[(row + at).clamp(max=len(stored.steps) - 1), lane].where(at < pieces.length[:, None], 0)
         back = min(max(int(steps.max()), 1), self.window)  # no further than the longest episode
-        rows = row + torch.arange(-back, x.shape[1] - 1, device=x.device)  # (S, M); a segment's last item is not seen
+        rows = row + torch.arange(-back, x.shape[1] - 1)  # (S, M); a segment's last item is not seen
         rows = rows.clamp(max=len(stored.steps) - 1)
-        age = at[:, None] + torch.arange(back, 1 - x.shape[1], -1, device=x.device)  # (L, M)
-        seen = visible(age, steps[..., None], self.window)  # (S, L, M)
+        age = (at[:, None] + torch.arange(back, 1 - x.shape[1], -1)).to(x.device)  # (L, M)
+        steps, item_steps = steps.to(x.device), stored.steps[rows, lane].to(x.device)  # (S, L), (S, M)
 
+        seen = visible(age, steps[..., None], self.window)  # (S, L, M)
         used = seen.any(1)  # (S, M)
-        items = stored.items[rows, lane].masked_fill(~used[..., None, None], 0.0)  # (S, M, K, D)
-        position = self.position(stored.steps[rows, lane].where(used, 0), x.dtype)  # (S, M, D)
+        items = stored.items[rows.to(x.device), lane.to(x.device)]  # (S, M, K, D)
+        items = items.masked_fill(~used[..., None, None], 0.0)
+        position = self.position(item_steps.where(used, 0), x.dtype)  # (S, M, D)
         for k, block in enumerate(self.blocks):
             encoding = self.query_encoding(steps, x.dtype) if k == 0 else 0.0
             x = block(x, encoding, block.keys_values(items[:, :, k] + position), age, seen)
-        return x[real]
+        return x.flatten(0, 1).index_select(0, pieces.slots().to(x.device))
 
     def position(self, steps: Tensor, dtype: torch.dtype) -> Tensor | float:
         """Return the encoding (..., D) of items that were made at these steps of their episodes."""
@@ -862,7 +868,7 @@ class Memory(nn.Module):
     def numbers(self, pieces: Pieces, stored: Timeline) -> dict[str, float]:
         """Return what to log of a minibatch: the share of padding, and the longest window that any of its steps saw."""
         padding = 1 - float(pieces.length.float().mean() / pieces.length.max())
-        longest = stored.steps.flatten()[pieces.steps().to(stored.steps.device) + self.window * pieces.lanes].max()
+        longest = stored.steps.flatten()[pieces.steps() + self.window * pieces.lanes].max()
         return {"padding_fraction": padding, "memory_window": min(int(longest), self.window)}
 
 
@@ -1073,7 +1079,7 @@ def collect(
                 rollout.truncation_values[t] = value * rollout.truncated[t]
 
             done = terminated | truncated
-            play.live = agent.memory.reset(live, torch.as_tensor(done, device=device))
+            play.live = agent.memory.reset(live, torch.as_tensor(done))
             note_episodes(play, rewards, done, infos, episodes)
             if recorder is not None and done[0]:
                 recorder.end_episode()
@@ -1254,7 +1260,7 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
         actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
         obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
         done = terminated | truncated
-        live = agent.memory.reset(live, torch.as_tensor(done, device=device))
+        live = agent.memory.reset(live, torch.as_tensor(done))
         found["return"] += rewards * playing
         found["length"] += playing
         for name, values in final_numbers(infos, done & playing):
@@ -1295,6 +1301,8 @@ def setup(args: Args) -> Run:
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
     device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")  # TF32
     options = reset_options(args.env_id, args.env_options)
     envs = make_envs(args, args.num_envs, "debug_rgb_array" if args.capture_video else None)
     if envs.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
