@@ -29,7 +29,7 @@ from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, magnify, make_she
 from memory_gym_envs.entries import Entries, vector_slices
 from memory_gym_envs.looks import LARGEST, Looks, View, agent_entries, covered, look, make_looks
 from memory_gym_envs.options import Option
-from memory_gym_envs.words import Tape, below
+from memory_gym_envs.words import Tape, below, pick
 
 TILE = 12  # pixels
 SIDE = 7  # tiles along one side of the screen, and of a segment of the endless path
@@ -286,8 +286,7 @@ def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Varian
     if variant.endless:
         level = draw_segments(tape, below(tape, SIDE), 0, FIRST_SEGMENTS)
     else:
-        choices = values["cardinal_origin_choice"]
-        side = choices[below(tape, len(choices))] if len(choices) > 1 else choices[0]
+        side = pick(tape, values["cardinal_origin_choice"])
         start, end = below(tape, SIDE), below(tape, SIDE)
         near, far = (0, SIDE - 1) if side in (0, 2) else (SIDE - 1, 0)
         if side in (0, 1):
