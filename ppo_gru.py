@@ -41,7 +41,7 @@ from torch.nn.utils.rnn import pad_sequence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-import memory_gym_envs  # noqa: F401 (registers the Memory Gym ids)
+from memory_gym_envs.wrappers import GrayscaleStack, StepEncoding, VectorStack
 
 
 # ---- 1 ARGS ----
@@ -57,6 +57,8 @@ class Args:
     """ask cuDNN for deterministic algorithms"""
     cuda: bool = True
     """train on the GPU when there is one"""
+    amp: bool = False
+    """compute the networks in bfloat16, twice as fast on processors that have it; losses stay in float32"""
     track: bool = False
     """log to Weights and Biases too (needs the extra `track`)"""
     wandb_project_name: str = "memory-gym-baselines"
@@ -78,6 +80,12 @@ class Args:
     """how many levels a Memory Gym environment trains on (0: no limit)"""
     start_level: int = 0
     """the first of these levels"""
+    obs_type: Literal["pixels", "vector"] = "pixels"
+    """what a Memory Gym environment shows: pictures, or a vector of all that is to be seen on them"""
+    frame_stack: int = 0
+    """observe the last so many pictures at once, in grayscale, or so many vectors (0: only the present, in colour)"""
+    step_encoding: bool = False
+    """observe the number of the episode's step too, as a sinusoidal encoding of width 16"""
 
     total_timesteps: int = 163_840_000
     """steps to train for, all lanes together, rounded down to whole iterations of num_envs x num_steps"""
@@ -117,6 +125,23 @@ class Args:
     """weight of the entropy bonus from step --anneal-steps on"""
     anneal_steps: int = 163_840_000
     """steps over which both decay linearly (0: both keep their initial values)"""
+    reconstruction_coef: float = 0.0
+    """weight of the loss of drawing the observed picture from the memory's output (0: not drawn; the thesis has 0.1)"""
+    ground_truth_coef: float = 0.0
+    """weight of the loss of estimating the environment's ground truth (0: not estimated; the thesis has 0.1)"""
+    ground_truth_detach: bool = False
+    """estimate without teaching the agent: a probe of what its memory holds"""
+    head_size: int = 512
+    """width of the layer behind the memory, and of the heads' own layers"""
+
+    eval_interval: int = 0
+    """iterations from one evaluation to the next, on levels that are not trained on (0: none)"""
+    eval_levels: int = 50
+    """levels of an evaluation, those that follow the training levels"""
+    eval_repeats: int = 3
+    """how often an evaluation plays each level"""
+    eval_max_steps: int = 10_000
+    """steps after which an evaluation cuts an endless episode short"""
 
     memory: Literal["gru", "lstm", "none"] = "gru"
     """what the agent remembers with"""
@@ -135,11 +160,14 @@ def flag(name: str) -> str:
 
 def check_args(args: Args) -> None:
     """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work."""
-    integers = [("num_levels", 0), ("start_level", 0), ("anneal_steps", 0), ("seq_len", 0), ("seed", 0)]
+    integers = [(name, 0) for name in ("num_levels", "start_level", "anneal_steps", "seed")]
+    integers += [(name, 0) for name in ("frame_stack", "eval_interval", "seq_len")]
     integers += [(name, 1) for name in ("num_envs", "num_steps", "num_minibatches", "update_epochs")]
+    integers += [(name, 1) for name in ("head_size", "eval_levels", "eval_repeats", "eval_max_steps")]
     integers += [(name, 1) for name in ("total_timesteps", "hidden_size", "num_layers")]
     numbers = [("gamma", 0, 1), ("gae_lambda", 0, 1)]
     numbers += [(name, 0, math.inf) for name in ("vf_coef", "init_lr", "final_lr", "init_ent_coef", "final_ent_coef")]
+    numbers += [(name, 0, math.inf) for name in ("reconstruction_coef", "ground_truth_coef")]
     for name, low in integers:
         if not low <= getattr(args, name) < 2**63:
             raise ValueError(f"{flag(name)} is {getattr(args, name)}; it must be {low} or more (and below 2 ** 63)")
@@ -167,30 +195,41 @@ def check_args(args: Args) -> None:
 
 
 # ---- 2 ENVIRONMENTS ----
-def make_envs(env_id: str, num_envs: int, num_levels: int, start_level: int, video: bool) -> gym.vector.VectorEnv:
+def make_envs(args: Args, num_envs: int, render_mode: str | None = None) -> gym.vector.VectorEnv:
     """Make a vector environment with same-step autoreset: an ended lane's next observation begins a new episode.
 
-    Uses the id's own vector entry point where that resets in the same step, else Gymnasium's synchronous one. With
-    video, render() returns a picture a lane. Raises gymnasium.error.Error for an unknown id, ImportError for a missing
-    package or module, ValueError for wrong levels.
+    With a render_mode, render() returns a picture a lane: debug_rgb_array, which Memory Gym alone has, or rgb_array.
+    Raises gymnasium.error.Error for an unknown id, ImportError for a missing package or module, ValueError for wrong
+    levels and for an observation that the environment does not offer.
     """
-    module, _, name = env_id.rpartition(":")
+    module, _, name = args.env_id.rpartition(":")
     if module:
         importlib.import_module(module)
     levels = is_memory_gym(name)
-    kwargs = {"num_levels": num_levels, "start_level": start_level} if levels else {}
-    if video:
-        kwargs["render_mode"] = "debug_rgb_array" if levels else "rgb_array"
-    same_step = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    kwargs = {"render_mode": render_mode if levels else "rgb_array"} if render_mode else {}
+    if levels:
+        kwargs |= {"num_levels": args.num_levels, "start_level": args.start_level, "obs_type": args.obs_type}
+    elif args.obs_type != "pixels":
+        raise ValueError(f"--obs-type is of Memory Gym environments; {args.env_id} has one kind of observation")
     try:
-        if gym.spec(name).vector_entry_point is not None:
-            envs = gym.make_vec(name, num_envs, **kwargs)
-            if envs.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:
-                return envs
-            envs.close()
-        return gym.make_vec(name, num_envs, vectorization_mode="sync", vector_kwargs=same_step, **kwargs)
+        envs = same_step_envs(name, num_envs, kwargs)
     except TypeError as error:  # what a constructor says of an argument that it does not take
-        raise ValueError(f"{env_id} cannot be made: {error}") from None
+        raise ValueError(f"{args.env_id} cannot be made: {error}") from None
+    if args.frame_stack:
+        pictures = any(len(part.shape) == 3 for part in observation_spaces(envs.single_observation_space).values())
+        envs = (GrayscaleStack if pictures else VectorStack)(envs, args.frame_stack)
+    return StepEncoding(envs) if args.step_encoding else envs
+
+
+def same_step_envs(name: str, num_envs: int, kwargs: dict[str, Any]) -> gym.vector.VectorEnv:
+    """Make the id's own vector environment if it resets in the same step, else Gymnasium's synchronous one."""
+    if gym.spec(name).vector_entry_point is not None:
+        envs = gym.make_vec(name, num_envs, **kwargs)
+        if envs.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:
+            return envs
+        envs.close()
+    same_step = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    return gym.make_vec(name, num_envs, vectorization_mode="sync", vector_kwargs=same_step, **kwargs)
 
 
 def is_memory_gym(env_id: str) -> bool:
@@ -211,16 +250,23 @@ def reset_options(env_id: str, env_options: str) -> dict | None:
     return options or None
 
 
-def first_reset(envs: gym.vector.VectorEnv, seed: int, options: dict | None) -> dict[str, Tensor]:
-    """Seed every lane with its own stream, then begin each lane's first episode; return its observations (N, ...).
+def first_reset(envs: gym.vector.VectorEnv, seed: int, options: dict | None) -> tuple[dict[str, Tensor], dict]:
+    """Seed every lane with its own stream, then begin each lane's first episode; return observations (N, ...), infos.
 
     Raises ValueError for a reset parameter that the environment does not have or allow.
     """
     # Neighbouring run seeds must not share lanes, so the lanes' seeds count up from a hash of the run's seed.
     envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]), options=options)
     # An explicit seed is a level of its own; from here on the levels come from the training set.
-    obs, _ = envs.reset(options=options)
-    return as_tensors(obs)
+    obs, infos = envs.reset(options=options)
+    return as_tensors(obs), infos
+
+
+def ground_truth_of(infos: dict) -> Tensor:
+    """Return the ground truth (N, G) in the infos; raise ValueError if the environment reports none."""
+    if "ground_truth" not in infos:
+        raise ValueError("--ground-truth-coef needs an environment that has ground_truth in its info; use 0")
+    return torch.as_tensor(infos["ground_truth"], dtype=torch.float32)
 
 
 def observation_spaces(space: gym.Space) -> dict[str, gym.spaces.Box]:
@@ -353,6 +399,11 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: f
     return loss.mean()
 
 
+def reconstruction_loss(logits: Tensor, pixels: Tensor) -> Tensor:
+    """Return the mean binary cross-entropy (5.5) of drawn pictures, as logits, and the pixels, both (R, H, W, C)."""
+    return F.binary_cross_entropy_with_logits(logits, pixels / 255 if pixels.dtype == torch.uint8 else pixels)
+
+
 @dataclass
 class Pieces:
     """Runs of consecutive steps of one lane each. Step t of lane n has the flat index t * N + n."""
@@ -437,28 +488,64 @@ class Encoder(nn.Module):
         if self.vectors:
             features.append(F.relu(self.mlp(torch.cat([obs[name].float() for name in self.vectors], -1))))
         features = torch.cat(features, -1) if len(features) > 1 else features[0]
-        return F.relu(self.embedding(features))
+        return F.relu(self.embedding(features)).float()
+
+
+class Decoder(nn.Sequential):
+    """The Atari CNN turned round, which draws the observed picture (5.1.2, table 6.2).
+
+    Maps features (B, F) to logits (B, height, width, channels). Raises ValueError unless there is one picture to draw.
+    """
+
+    def __init__(self, features: int, spaces: dict[str, gym.spaces.Box]):
+        pictures = [space.shape for space in spaces.values() if len(space.shape) == 3]
+        if len(pictures) != 1:
+            raise ValueError(f"--reconstruction-coef needs an observation with one picture, not {len(pictures)}; use 0")
+        height, width, channels = pictures[0]
+        sizes = [(height, width)]  # of the pictures between the layers, from the last one to the first
+        for kernel, stride in ((8, 4), (4, 2), (3, 1)):
+            sizes.append(tuple((size - kernel) // stride + 1 for size in sizes[-1]))
+        rest = [[(size - kernel) % stride for size in sizes[i]] for i, (kernel, stride) in enumerate(((8, 4), (4, 2)))]
+        super().__init__(
+            layer_init(nn.Linear(features, 64 * math.prod(sizes[3]))),
+            nn.ReLU(inplace=True),
+            nn.Unflatten(1, (64, *sizes[3])),
+            layer_init(nn.ConvTranspose2d(64, 64, 3, 1)),
+            nn.ReLU(inplace=True),
+            layer_init(nn.ConvTranspose2d(64, 32, 4, 2, output_padding=rest[1])),
+            nn.ReLU(inplace=True),
+            layer_init(nn.ConvTranspose2d(32, channels, 8, 4, output_padding=rest[0]), 1.0),
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Draw the pictures, in pieces that suit a CPU's caches as the encoder's do."""
+        chunks = features.split(256) if features.device.type == "cpu" else [features]
+        return torch.cat([super(Decoder, self).forward(chunk) for chunk in chunks]).permute(0, 2, 3, 1)
 
 
 class Heads(nn.Module):
     """The layer after the memory, the multi-discrete policy and the state value (table 6.2)."""
 
-    def __init__(self, width: int, branches: list[int]):
+    def __init__(self, width: int, branches: list[int], size: int):
         super().__init__()
         self.branches = branches
-        self.trunk = layer_init(nn.Linear(width, 512))
-        self.policy = nn.Sequential(
-            layer_init(nn.Linear(512, 512)), nn.ReLU(inplace=True), layer_init(nn.Linear(512, sum(branches)), 0.1)
-        )
-        self.value = nn.Sequential(
-            layer_init(nn.Linear(512, 512)), nn.ReLU(inplace=True), layer_init(nn.Linear(512, 1), 1.0)
-        )
+        self.trunk = layer_init(nn.Linear(width, size))
+        self.policy = head(size, sum(branches), 0.1)
+        self.value = head(size, 1, 1.0)
 
-    def forward(self, x: Tensor) -> tuple[list[Categorical], Tensor]:
-        """Map what the memory says, (B, D), to a distribution of each action branch and to values (B,)."""
-        x = F.relu(self.trunk(x))
-        logits = self.policy(x).split(self.branches, -1)
-        return [Categorical(logits=part, validate_args=False) for part in logits], self.value(x)[:, 0]
+    def forward(self, x: Tensor) -> tuple[list[Categorical], Tensor, Tensor]:
+        """Map what the memory says, (B, D), to a distribution of each branch, values (B,) and features (B, F)."""
+        features = F.relu(self.trunk(x))
+        logits = self.policy(features).float().split(self.branches, -1)
+        policy = [Categorical(logits=part, validate_args=False) for part in logits]
+        return policy, self.value(features)[:, 0].float(), features
+
+
+def head(size: int, outputs: int, gain: float) -> nn.Sequential:
+    """Make a head with a layer of its own."""
+    return nn.Sequential(
+        layer_init(nn.Linear(size, size)), nn.ReLU(inplace=True), layer_init(nn.Linear(size, outputs), gain)
+    )
 
 
 # ---- 5 MEMORY ----
@@ -547,8 +634,8 @@ class Memory(nn.Module):
             # The outputs are activated already: another ReLU behind them would throw half of them away (5.2.4).
             self.rnn = layer_init(rnn(self.width, self.width, args.num_layers, batch_first=True), 1.0)
 
-    def initial(self, lanes: int, device: torch.device) -> Tensor:
-        """Return the live memory (N, P, D) of fresh episodes."""
+    def initial(self, lanes: int, device: torch.device, num_steps: int) -> Tensor:
+        """Return the live memory (N, P, D) of fresh episodes, the same for rollouts of any length."""
         return torch.zeros(lanes, self.hidden_vectors, self.width, device=device)
 
     def storage(self, num_steps: int, lanes: int, device: torch.device) -> Tensor:
@@ -598,10 +685,9 @@ class Memory(nn.Module):
         if self.kind == "none":
             return x, live
         state = live.transpose(0, 1).contiguous()  # (P, S, D)
-        if self.kind == "gru":
-            y, state = self.rnn(x, state)
-        else:
-            y, state = self.rnn(x, state.chunk(2))
+        with torch.autocast(x.device.type, enabled=False):  # rounding would add up from step to step
+            y, state = self.rnn(x, state if self.kind == "gru" else state.chunk(2))
+        if self.kind == "lstm":
             state = torch.cat(state)
         return y, state.transpose(0, 1)
 
@@ -614,45 +700,74 @@ class Memory(nn.Module):
 class Agent(nn.Module):
     """Encoder, memory and heads. Plays step by step with `act`, learns from whole pieces with `evaluate`.
 
-    Raises ValueError for spaces that it cannot encode or act in.
+    ground_truths is how many numbers the environment's ground truth has. Raises ValueError for spaces that it cannot
+    encode, act in or draw.
     """
 
-    def __init__(self, observation_space: gym.Space, action_space: gym.Space, args: Args):
+    def __init__(self, observation_space: gym.Space, action_space: gym.Space, args: Args, ground_truths: int = 0):
         super().__init__()
+        spaces = observation_spaces(observation_space)
         self.memory = Memory(args)
-        self.encoder = Encoder(observation_spaces(observation_space), self.memory.width)
-        self.heads = Heads(self.memory.width, action_branches(action_space))
+        self.encoder = Encoder(spaces, self.memory.width)
+        self.heads = Heads(self.memory.width, action_branches(action_space), args.head_size)
+        self.decoder = Decoder(args.head_size, spaces) if args.reconstruction_coef else None
+        self.estimator = head(args.head_size, ground_truths, 1.0) if args.ground_truth_coef else None
 
     def act(self, obs: dict[str, Tensor], live: Any) -> tuple[list[Categorical], Tensor, Any, Any]:
         """Take one step of all lanes: the action distributions, values (N,), new live memory, and what to store."""
         x, live, stored = self.memory.step(self.encoder(obs), live)
-        return *self.heads(x), live, stored
+        policy, values, _ = self.heads(x)
+        return policy, values, live, stored
 
-    def evaluate(self, obs: dict[str, Tensor], pieces: Pieces, stored: Any) -> tuple[list[Categorical], Tensor]:
-        """Recompute the action distributions and values (R,) of the steps of the pieces, in the pieces' order."""
+    def evaluate(self, obs: dict[str, Tensor], pieces: Pieces, stored: Any) -> tuple[list[Categorical], Tensor, Tensor]:
+        """Recompute the distributions, values (R,) and features (R, F) of the pieces' steps, in the pieces' order."""
         return self.heads(self.memory.unroll(self.encoder(obs), pieces, stored))
 
 
+class MemoryLimit(ValueError):
+    """A memory cannot hold what it is given; says which flag helps. Raised by `Memory.step`."""
+
+
+def make_agent(envs: gym.vector.VectorEnv, infos: dict, args: Args, device: torch.device) -> Agent:
+    """Make the agent for the environments, whose infos have the ground truth if that is to be estimated.
+
+    Raises ValueError for spaces that do not suit, or if there is no ground truth.
+    """
+    ground_truths = ground_truth_of(infos).shape[1] if args.ground_truth_coef else 0
+    return Agent(envs.single_observation_space, envs.single_action_space, args, ground_truths).to(device)
+
+
 def save_model(agent: Agent, args: Args, path: str) -> None:
-    """Write weights and arguments to path, whole or not at all."""
-    torch.save({"args": asdict(args), "weights": agent.state_dict()}, path + ".part")
+    """Write weights, arguments and the script's name to path, whole or not at all."""
+    saved = {"script": script_name(), "args": asdict(args), "weights": agent.state_dict()}
+    torch.save(saved, path + ".part")
     os.replace(path + ".part", path)
+
+
+def script_name() -> str:
+    """Return the name of this script, without .py."""
+    return os.path.splitext(os.path.basename(__file__))[0]
 
 
 def load_model(path: str) -> tuple[Args, dict[str, Tensor]]:
     """Read the arguments and the weights, on the CPU, of a file that `save_model` wrote.
 
-    Raises ValueError if the file is not such a file, OSError if it cannot be read.
+    Raises ValueError if the file is not such a file or another script's, OSError if it cannot be read.
     """
     if not os.path.isfile(path):
         raise OSError(f"there is no file {path}; --save-model writes model.pt to the run folder")
-    with open(path, "rb") as file:
-        try:
+    try:
+        with open(path, "rb") as file:
             saved = torch.load(file, map_location="cpu", weights_only=True)
-            known = {field.name for field in fields(Args)}
-            return Args(**{k: v for k, v in saved["args"].items() if k in known}), saved["weights"]
-        except Exception:  # what torch.load raises for a file of another kind is many things, and none tells more
-            raise ValueError(f"{path} is not a model that --save-model wrote") from None
+        script, given, weights = saved["script"], saved["args"], saved["weights"]
+    except OSError:
+        raise
+    except Exception:  # what torch.load raises for a file of another kind is many things, and none tells more
+        raise ValueError(f"{path} is not a model that --save-model wrote") from None
+    if script != script_name():
+        raise ValueError(f"{path} was trained by {script}.py, not by {script_name()}.py")
+    known = {field.name for field in fields(Args)}
+    return Args(**{name: value for name, value in given.items() if name in known}), weights
 
 
 def load_weights(agent: Agent, path: str) -> None:
@@ -664,7 +779,9 @@ def load_weights(agent: Agent, path: str) -> None:
     try:
         agent.load_state_dict(weights)
     except (RuntimeError, TypeError):
-        flags = [f"{flag(name)} {getattr(saved_args, name)}" for name in ("env_id", *agent.memory.flags)]
+        shaping = ("env_id", *agent.memory.flags, "head_size", "obs_type", "frame_stack", "step_encoding")
+        shaping += ("reconstruction_coef", "ground_truth_coef")
+        flags = [f"{flag(name)} {getattr(saved_args, name)}" for name in shaping]
         raise ValueError(f"{path} holds the weights of another network, trained with {' '.join(flags)}") from None
 
 
@@ -681,28 +798,8 @@ class Rollout:
     terminated: Tensor  # (T, N) the step ended its episode
     truncated: Tensor  # (T, N) the step ended its episode by a time limit
     truncation_values: Tensor  # (T, N) value of the final observation, where bootstrapped
+    ground_truth: Tensor | None  # (T, N, G), if it is estimated
     memory: Any  # what the memory stores of the steps
-
-
-def make_rollout(agent: Agent, obs: dict[str, Tensor], num_steps: int, device: torch.device) -> Rollout:
-    """Allocate a rollout for observations like obs, (N, ...) each."""
-    lanes = len(next(iter(obs.values())))
-
-    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-        return torch.zeros(num_steps, lanes, *shape, dtype=dtype, device=device)
-
-    branches = len(agent.heads.branches)
-    return Rollout(
-        obs={name: empty(*part.shape[1:], dtype=part.dtype) for name, part in on_device(obs, device).items()},
-        actions=empty(branches, dtype=torch.int64),
-        log_probs=empty(branches),
-        values=empty(),
-        rewards=empty(),
-        terminated=empty(dtype=torch.bool),
-        truncated=empty(dtype=torch.bool),
-        truncation_values=empty(),
-        memory=agent.memory.storage(num_steps, lanes, device),
-    )
 
 
 @dataclass
@@ -710,9 +807,37 @@ class Play:
     """Where the lanes are between two rollouts."""
 
     obs: dict[str, Tensor]  # (N, ...) the observations to act on next
+    ground_truth: Tensor | None  # (N, G) theirs, if it is estimated
     live: Any  # the live memory
     returns: np.ndarray  # (N,) undiscounted return of each lane's episode so far
     lengths: np.ndarray  # (N,) steps of each lane's episode so far
+
+
+def make_rollout(agent: Agent, play: Play, num_steps: int, device: torch.device) -> Rollout:
+    """Allocate a rollout for observations and ground truths like those of play."""
+    lanes = len(play.returns)
+
+    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.zeros(num_steps, lanes, *shape, dtype=dtype, device=device)
+
+    branches = len(agent.heads.branches)
+    return Rollout(
+        obs={name: empty(*part.shape[1:], dtype=part.dtype) for name, part in on_device(play.obs, device).items()},
+        actions=empty(branches, dtype=torch.int64),
+        log_probs=empty(branches),
+        values=empty(),
+        rewards=empty(),
+        terminated=empty(dtype=torch.bool),
+        truncated=empty(dtype=torch.bool),
+        truncation_values=empty(),
+        ground_truth=empty(play.ground_truth.shape[1]) if play.ground_truth is not None else None,
+        memory=agent.memory.storage(num_steps, lanes, device),
+    )
+
+
+def autocast(args: Args, device: torch.device) -> torch.autocast:
+    """Return the context in which the networks compute in bfloat16 with --amp; it keeps the weights' casts."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=args.amp)
 
 
 @torch.no_grad()
@@ -726,34 +851,49 @@ def collect(
     """
     device, episodes = rollout.values.device, defaultdict(list)
     rollout.truncation_values.zero_()
-    play.live = agent.memory.refresh(play.live, rollout.memory)
-    for t in range(args.num_steps):
-        for name, part in play.obs.items():
-            rollout.obs[name][t] = part  # the first and only copy: env to device, dtype kept
-        obs = {name: part[t] for name, part in rollout.obs.items()}
-        policy, rollout.values[t], live, stored = agent.act(obs, play.live)
-        agent.memory.store(rollout.memory, t, stored)
-        actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
-        rollout.actions[t], rollout.log_probs[t] = actions, log_probs_of(policy, actions)
-        if recorder is not None:
-            recorder.capture()
+    with autocast(args, device):
+        play.live = agent.memory.refresh(play.live, rollout.memory)
+        for t in range(args.num_steps):
+            actions, live = decide(agent, play, rollout, t)
+            if recorder is not None:
+                recorder.capture()
 
-        obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
-        play.obs = as_tensors(obs)
-        rollout.rewards[t] = torch.as_tensor(rewards)
-        rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
-        if args.bootstrap_truncated and truncated.any():
-            final = on_device(final_observations(play.obs, infos, truncated), device)
-            value = agent.act(final, live)[1]  # from the memory as it was before the reset
-            rollout.truncation_values[t] = value * rollout.truncated[t]
+            obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
+            play.obs = as_tensors(obs)
+            if rollout.ground_truth is not None:
+                play.ground_truth = ground_truth_of(infos)
+            rollout.rewards[t] = torch.as_tensor(rewards)
+            rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
+            if args.bootstrap_truncated and truncated.any():
+                final = on_device(final_observations(play.obs, infos, truncated), device)
+                value = agent.act(final, live)[1]  # from the memory as it was before the reset
+                rollout.truncation_values[t] = value * rollout.truncated[t]
 
-        done = terminated | truncated
-        play.live = agent.memory.reset(live, torch.as_tensor(done, device=device))
-        note_episodes(play, rewards, done, infos, episodes)
-        if recorder is not None and done[0]:
-            recorder.end_episode()
-    _, last_value, _, _ = agent.act(on_device(play.obs, device), play.live)
+            done = terminated | truncated
+            play.live = agent.memory.reset(live, torch.as_tensor(done, device=device))
+            note_episodes(play, rewards, done, infos, episodes)
+            if recorder is not None and done[0]:
+                recorder.end_episode()
+        _, last_value, _, _ = agent.act(on_device(play.obs, device), play.live)
     return last_value, episodes
+
+
+def decide(agent: Agent, play: Play, rollout: Rollout, t: int) -> tuple[Tensor, Any]:
+    """Choose the lanes' actions (N, A) of step t, and put away all that the choice is learned from.
+
+    Returns the new live memory too, as it is before the step may end episodes.
+    """
+    for name, part in play.obs.items():
+        rollout.obs[name][t] = part  # the first and only copy: env to device, dtype kept
+    if rollout.ground_truth is not None:
+        rollout.ground_truth[t] = play.ground_truth
+    policy, rollout.values[t], live, stored = agent.act(
+        {name: part[t] for name, part in rollout.obs.items()}, play.live
+    )
+    agent.memory.store(rollout.memory, t, stored)
+    actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
+    rollout.actions[t], rollout.log_probs[t] = actions, log_probs_of(policy, actions)
+    return actions, live
 
 
 def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
@@ -784,12 +924,18 @@ def note_episodes(play: Play, rewards: np.ndarray, done: np.ndarray, infos: dict
     episodes["charts/episodic_return"] += play.returns[done].tolist()
     episodes["charts/episodic_length"] += play.lengths[done].tolist()
     play.returns[done], play.lengths[done] = 0, 0
+    for name, values in final_numbers(infos, done):
+        episodes[f"episode/{name}"] += values.tolist()
+
+
+def final_numbers(infos: dict, lanes: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield each number in the final infos by name, of the given lanes, all of which have just ended an episode."""
     final = infos.get("final_info", {})
     for name, values in final.items():
-        if f"_{name}" in final and isinstance(values, np.ndarray):
-            ended = np.array(values[done & final[f"_{name}"]].tolist())
+        if f"_{name}" in final and isinstance(values, np.ndarray) and lanes.any():
+            ended = np.array(values[lanes & final[f"_{name}"]].tolist())
             if ended.ndim == 1 and ended.dtype.kind in "biuf":
-                episodes[f"episode/{name}"] += ended.tolist()
+                yield name, ended
 
 
 def minibatch_loss(
@@ -801,7 +947,9 @@ def minibatch_loss(
     def take(stored: Tensor) -> Tensor:
         return stored.flatten(0, 1).index_select(0, steps)
 
-    policy, values = agent.evaluate({k: take(v) for k, v in rollout.obs.items()}, pieces, rollout.memory)
+    obs = {name: take(part) for name, part in rollout.obs.items()}
+    with autocast(args, steps.device):
+        policy, values, features = agent.evaluate(obs, pieces, rollout.memory)
     log_ratio = log_probs_of(policy, take(rollout.actions)) - take(rollout.log_probs)  # (R, A)
     entropy = torch.stack([branch.entropy() for branch in policy], -1).sum(-1).mean()
     advantages, returns = map(take, targets)
@@ -810,19 +958,31 @@ def minibatch_loss(
     pg_loss = policy_loss(log_ratio, advantages, args.clip_coef)
     v_loss = value_loss(values, take(rollout.values), returns, args.clip_coef if args.clip_vloss else None)
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
-    with torch.no_grad():
-        off, joint = log_ratio.exp() - 1, log_ratio.sum(-1)  # the branches are independent: log-ratios add up
-        logs = {
-            "losses/policy_loss": pg_loss,
-            "losses/value_loss": v_loss,
-            "losses/entropy": entropy,
-            "losses/loss": loss,
-            "losses/old_approx_kl": -joint.mean(),
-            "losses/approx_kl": (joint.exp() - 1 - joint).mean(),  # http://joschu.net/blog/kl-approx.html
-            "losses/clipfrac": (off.abs() > args.clip_coef).float().mean(),
-            "losses/ratio_error": off.abs().max(),
-        }
-    return loss, {name: value.detach() for name, value in logs.items()}
+    logs = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, **policy_numbers(log_ratio, args)}
+    if agent.decoder is not None:
+        pixels = next(obs[name] for name in agent.encoder.pixels)
+        with autocast(args, steps.device):
+            drawn = agent.decoder(features)
+        logs["reconstruction_loss"] = reconstruction_loss(drawn.float(), pixels)
+        loss = loss + args.reconstruction_coef * logs["reconstruction_loss"]
+    if agent.estimator is not None:
+        estimate = agent.estimator((features.detach() if args.ground_truth_detach else features).float())
+        logs["ground_truth_loss"] = F.mse_loss(estimate, take(rollout.ground_truth))  # (5.6)
+        loss = loss + args.ground_truth_coef * logs["ground_truth_loss"]
+    logs["loss"] = loss
+    return loss, {f"losses/{name}": value.detach() for name, value in logs.items()}
+
+
+@torch.no_grad()
+def policy_numbers(log_ratio: Tensor, args: Args) -> dict[str, Tensor]:
+    """Return what to log of log_ratio (R, A): how far the policy has moved from the rollout's."""
+    off, joint = log_ratio.exp() - 1, log_ratio.sum(-1)  # the branches are independent: log-ratios add up
+    return {
+        "old_approx_kl": -joint.mean(),
+        "approx_kl": (joint.exp() - 1 - joint).mean(),  # http://joschu.net/blog/kl-approx.html
+        "clipfrac": (off.abs() > args.clip_coef).float().mean(),
+        "ratio_error": off.abs().max(),
+    }
 
 
 def update(
@@ -867,11 +1027,53 @@ def explained_variance(values: Tensor, returns: Tensor) -> float:
     return 1 - (returns - values).var().item() / variance if variance > 0 else math.nan
 
 
+@torch.no_grad()
+def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps: int = 64) -> dict[str, np.ndarray]:
+    """Play each level of `evaluation_levels` once, a lane each, with fresh memory and the stochastic policy (6.1.3).
+
+    Returns numbers (N,) by name: return, length, finished (0 for an episode that was cut short), and every number in
+    an episode's final info. Draws from torch's generator; the memory is refreshed every memory_steps steps.
+    """
+    levels = evaluation_levels(args)
+    device, options = next(agent.parameters()).device, reset_options(args.env_id, args.env_options)
+    obs, _ = envs.reset(seed=levels, options=options)
+    live = agent.memory.initial(len(levels), device, memory_steps)
+    stored = agent.memory.storage(memory_steps, len(levels), device)
+    playing = np.ones(len(levels), bool)
+    found = {name: np.zeros(len(levels)) for name in ("return", "length", "finished")}
+    for t in range(args.eval_max_steps):
+        if t % memory_steps == 0:
+            with autocast(args, device):
+                live = agent.memory.refresh(live, stored)
+        with autocast(args, device):
+            policy, _, live, item = agent.act(on_device(as_tensors(obs), device), live)
+        agent.memory.store(stored, t % memory_steps, item)
+        actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
+        obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
+        done = terminated | truncated
+        live = agent.memory.reset(live, torch.as_tensor(done, device=device))
+        found["return"] += rewards * playing
+        found["length"] += playing
+        for name, values in final_numbers(infos, done & playing):
+            found.setdefault(name, np.full(len(levels), np.nan))[done & playing] = values
+        playing &= ~done
+        if not playing.any():
+            break
+    return found | {"finished": 1.0 - playing}
+
+
+def evaluation_levels(args: Args) -> list[int]:
+    """Return the seeds (N,) of the levels that an evaluation plays: those after the training levels, with repeats."""
+    first = args.start_level + args.num_levels
+    return [first + level for level in range(args.eval_levels) for _ in range(args.eval_repeats)]
+
+
 @dataclass
 class Run:
     """All that training needs, made by `setup` from an Args."""
 
     envs: gym.vector.VectorEnv
+    eval_envs: gym.vector.VectorEnv | None
     agent: Agent
     optimizer: torch.optim.Optimizer
     rollout: Rollout
@@ -891,27 +1093,29 @@ def setup(args: Args) -> Run:
     torch.backends.cudnn.deterministic = args.torch_deterministic
     device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
     options = reset_options(args.env_id, args.env_options)
-    envs = make_envs(args.env_id, args.num_envs, args.num_levels, args.start_level, args.capture_video)
+    envs = make_envs(args, args.num_envs, "debug_rgb_array" if args.capture_video else None)
     if envs.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
         raise ValueError(f"{args.env_id} does not reset an ended episode in the same step")
-    obs = first_reset(envs, args.seed, options)
-    agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(device)
+    obs, infos = first_reset(envs, args.seed, options)
+    agent = make_agent(envs, infos, args, device)
     if args.load_model is not None:
         load_weights(agent, args.load_model)
     optimizer = torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)
+    ground_truth = ground_truth_of(infos) if agent.estimator is not None else None
     try:
-        rollout = make_rollout(agent, obs, args.num_steps, device)
+        live = agent.memory.initial(args.num_envs, device, args.num_steps)
+        play = Play(obs, ground_truth, live, np.zeros(args.num_envs), np.zeros(args.num_envs, np.int64))
+        rollout = make_rollout(agent, play, args.num_steps, device)
     except (MemoryError, RuntimeError):
         size = f"--num-envs {args.num_envs} x --num-steps {args.num_steps}"
         raise ValueError(f"a rollout of {size} does not fit in the memory of {device}; use fewer of either") from None
-    live = agent.memory.initial(args.num_envs, device)
-    play = Play(obs, live, np.zeros(args.num_envs), np.zeros(args.num_envs, np.int64))
+    eval_envs = make_envs(args, len(evaluation_levels(args))) if args.eval_interval else None
 
     folder = new_folder(args)
     recorder = LaneRecorder(envs, os.path.join(folder, "videos")) if args.capture_video else None
     if args.track:
         start_tracking(args, os.path.basename(folder))
-    return Run(envs, agent, optimizer, rollout, play, recorder, folder, open_writer(args, folder))
+    return Run(envs, eval_envs, agent, optimizer, rollout, play, recorder, folder, open_writer(args, folder))
 
 
 def new_folder(args: Args) -> str:
@@ -954,39 +1158,66 @@ def start_tracking(args: Args, name: str) -> None:
 
 
 def train(args: Args, run: Run) -> str:
-    """Train for --total-timesteps, rounded down to whole iterations, or until Ctrl-C; return the run folder."""
+    """Train for --total-timesteps, rounded down to whole iterations, or until Ctrl-C; return the run folder.
+
+    Whatever ends it, what was learned is kept. Raises MemoryLimit.
+    """
     recent = {"return": deque(maxlen=100), "length": deque(maxlen=100)}
     batch_size = args.num_envs * args.num_steps
-    start = time.perf_counter()
-    bar = tqdm(total=args.total_timesteps // batch_size * batch_size, unit=" steps", unit_scale=True)
-    with bar, contextlib.suppress(KeyboardInterrupt):  # Ctrl-C ends the training early and keeps what was learned
-        for step in range(0, bar.total, batch_size):
-            lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
-            ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
-            run.optimizer.param_groups[0]["lr"] = lr
-            last_value, episodes = collect(run.agent, run.envs, run.play, run.rollout, args, run.recorder)
-            scalars = update(run.agent, run.optimizer, run.rollout, last_value, ent_coef, args)
-
-            bar.update(batch_size)
-            speed = bar.n / (time.perf_counter() - start)
-            scalars |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef, "charts/SPS": speed}
-            scalars |= {name: float(np.mean(values)) for name, values in episodes.items()}
-            for name, value in scalars.items():
-                run.writer.add_scalar(name, value, bar.n)
-            for name, window in recent.items():
-                window.extend(episodes.get(f"charts/episodic_{name}", []))
-            shown = {name: f"{np.mean(window):.2f}" for name, window in recent.items() if window}
-            bar.set_postfix({**shown, "SPS": f"{speed:.0f}"})
-    if args.save_model:
-        save_model(run.agent, args, os.path.join(run.folder, "model.pt"))
-    run.writer.close()
-    run.envs.close()
+    iterations, start = args.total_timesteps // batch_size, time.perf_counter()
+    bar = tqdm(total=iterations * batch_size, unit=" steps", unit_scale=True)
+    try:
+        with bar, contextlib.suppress(KeyboardInterrupt):
+            for iteration in range(1, iterations + 1):
+                scalars, episodes = iterate(args, run, (iteration - 1) * batch_size)
+                if run.eval_envs is not None and (iteration % args.eval_interval == 0 or iteration == iterations):
+                    scalars |= evaluation_scalars(run, args)
+                step = iteration * batch_size
+                scalars["charts/SPS"] = step / (time.perf_counter() - start)
+                for name, value in scalars.items():
+                    run.writer.add_scalar(name, value, step)
+                for name, window in recent.items():
+                    window.extend(episodes.get(f"charts/episodic_{name}", []))
+                shown = {name: f"{np.mean(window):.2f}" for name, window in recent.items() if window}
+                bar.set_postfix({**shown, "SPS": f"{scalars['charts/SPS']:.0f}"}, refresh=False)
+                bar.update(batch_size)
+    finally:
+        if args.save_model:
+            save_model(run.agent, args, os.path.join(run.folder, "model.pt"))
+        run.writer.close()
+        for envs in filter(None, (run.envs, run.eval_envs)):
+            envs.close()
     return run.folder
 
 
+def iterate(args: Args, run: Run, step: int) -> tuple[dict[str, float], dict[str, list[float]]]:
+    """Play a rollout from this step of the training on, learn from it; return what to log, and the ended episodes."""
+    lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
+    ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
+    run.optimizer.param_groups[0]["lr"] = lr
+    last_value, episodes = collect(run.agent, run.envs, run.play, run.rollout, args, run.recorder)
+    scalars = update(run.agent, run.optimizer, run.rollout, last_value, ent_coef, args)
+    scalars |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
+    return scalars | {name: float(np.mean(values)) for name, values in episodes.items()}, episodes
+
+
+def evaluation_scalars(run: Run, args: Args) -> dict[str, float]:
+    """Return the means over an evaluation's episodes; training goes on as if there had been none."""
+    device = run.rollout.values.device
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        torch.manual_seed(args.seed)
+        found = evaluate(run.agent, run.eval_envs, args)
+    return {f"eval/{name}": float(np.nanmean(values)) for name, values in found.items()}
+
+
 def main(args: Args) -> str:
-    """Train an agent as the arguments say; return the run folder. Raises what `setup` raises."""
+    """Train an agent as the arguments say; return the run folder. Raises what `setup` and `train` raise."""
     return train(args, setup(args))
+
+
+def one_line(error: Exception) -> str:
+    """Return what to tell the user of an error."""
+    return f"{script_name()}.py: {' '.join(str(error).split())}"
 
 
 if __name__ == "__main__":
@@ -994,5 +1225,8 @@ if __name__ == "__main__":
     try:
         run = setup(args)
     except (ValueError, OSError, ImportError, gym.error.Error) as error:
-        sys.exit(f"{os.path.basename(__file__)}: {' '.join(str(error).split())}")
-    train(args, run)
+        sys.exit(one_line(error))
+    try:
+        train(args, run)
+    except MemoryLimit as error:
+        sys.exit(one_line(error))

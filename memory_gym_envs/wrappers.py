@@ -136,9 +136,7 @@ class GrayscaleStack(PictureWrapper):
 
     def __init__(self, env: VectorEnv, frames: int = 4):
         super().__init__(env)
-        if not isinstance(frames, (int, np.integer)) or frames < 1:
-            raise ValueError(f"frames must be an integer of at least 1, not {frames!r}")
-        shape = (*self.picture_shape[:2], int(frames))
+        shape = (*self.picture_shape[:2], stack_size(frames))
         self._stack = np.zeros((self.num_envs, *shape), np.uint8)
         space = self.replaced(env.single_observation_space, gym.spaces.Box(0, 255, shape, np.uint8))
         self._set_space(gym.spaces.Dict(space) if isinstance(space, dict) else space)
@@ -157,6 +155,39 @@ class GrayscaleStack(PictureWrapper):
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
         """The lanes' observations, with a copy of their stacks."""
         return self.replaced(observations, self._stack[lanes].copy())
+
+
+class VectorStack(SameStepWrapper):
+    """The last K vectors instead of the last one, for vector observations as `GrayscaleStack` for pictures.
+
+    frames: K.
+    Observation: Box (K * V,) float32, the newest vector last. An episode begins with its first vector K times.
+
+    Raises ValueError for an environment without same-step autoreset or vectors (V,) as observation, and for K below 1.
+    """
+
+    def __init__(self, env: VectorEnv, frames: int = 4):
+        super().__init__(env)
+        space = env.single_observation_space
+        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+            raise ValueError(f"VectorStack needs a vector to observe, not {space}")
+        frames = stack_size(frames)
+        self._stack = np.zeros((self.num_envs, frames, *space.shape), space.dtype)
+        low, high = (np.tile(bound, frames) for bound in (space.low, space.high))
+        self._set_space(gym.spaces.Box(low, high, dtype=space.dtype))
+
+    def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
+        """Fills the lanes' stacks with their first vector."""
+        self._stack[lanes] = observations[:, None]
+
+    def advance(self, observations: Any) -> None:
+        """Puts a vector on each stack."""
+        self._stack[:, :-1] = self._stack[:, 1:]
+        self._stack[:, -1] = observations
+
+    def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
+        """A copy of the lanes' stacks."""
+        return self._stack[lanes].reshape(-1, *self.single_observation_space.shape).copy()
 
 
 class StepEncoding(SameStepWrapper):
@@ -261,6 +292,13 @@ class SpotlightPerturbation(PictureWrapper):
 def gray(frames: np.ndarray) -> np.ndarray:
     """Colour pictures (..., 3) uint8 in grayscale, (...) uint8, rounded to the nearest."""
     return (frames @ LUMA + np.float32(0.5)).astype(np.uint8)
+
+
+def stack_size(frames: int) -> int:
+    """The number of frames of a stack; raises ValueError unless it is an integer of at least 1."""
+    if not isinstance(frames, (int, np.integer)) or frames < 1:
+        raise ValueError(f"frames must be an integer of at least 1, not {frames!r}")
+    return int(frames)
 
 
 def sinusoidal(positions: np.ndarray, width: int) -> np.ndarray:

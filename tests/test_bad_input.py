@@ -127,8 +127,11 @@ def test_a_model_of_another_network(tiny):
         ValueError, match="another network, trained with --env-id CueRecall-v0 --memory gru --hidden-size 32"
     ):
         ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path, hidden_size=64))
-    torch.save({"args": {}, "weights": 1}, path)
+    torch.save({"script": "ppo_gru", "args": {}, "weights": 1}, path)
     with pytest.raises(ValueError, match="another network"):
+        ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path))
+    torch.save({"script": "ppo_trxl", "args": {}, "weights": {}}, path)
+    with pytest.raises(ValueError, match=r"was trained by ppo_trxl\.py, not by ppo_gru\.py"):
         ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path))
     torch.save({"weights": 1}, path)
     with pytest.raises(ValueError, match="is not a model that --save-model wrote"):
@@ -146,3 +149,16 @@ def test_missing_extras(tiny, monkeypatch):
     assert setup_error(tiny(capture_video=True)) == message
     monkeypatch.setitem(sys.modules, "wandb", None)
     assert setup_error(tiny(track=True)) == '--track needs wandb: pip install -e ".[track]"'
+
+
+def test_an_episode_that_outlasts_a_learned_encoding(tmp_path):
+    """One line, and what was learned is kept."""
+    flags = "--env-id MysteryPath-Grid-v0 --obs-type vector --trxl-positional-encoding learned --trxl-pe-length 40"
+    sizes = "--trxl-dim 8 --trxl-num-heads 1 --num-envs 2 --num-steps 32 --num-minibatches 2 --total-timesteps 640"
+    command = [sys.executable, ppo_trxl.__file__, *flags.split(), *sizes.split(), "--no-cuda", "--save-model"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("ppo_trxl.py: --trxl-pe-length is 40, but an episode is longer; make it"), done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(list(tmp_path.glob("runs/*/model.pt"))) == 1

@@ -31,7 +31,7 @@ def recompute(run):
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
     steps = pieces.steps()
     obs = {name: part.flatten(0, 1)[steps] for name, part in rollout.obs.items()}
-    policy, values = run.agent.evaluate(obs, pieces, rollout.memory)
+    policy, values, _ = run.agent.evaluate(obs, pieces, rollout.memory)
     log_probs = ppo_gru.log_probs_of(policy, rollout.actions.flatten(0, 1)[steps])
     return steps, (log_probs - rollout.log_probs.flatten(0, 1)[steps]).exp(), values
 
@@ -49,6 +49,15 @@ def test_ratio_is_one_for_every_sample(played, env_id, memory):
     if env_id == "CueRecall-v0":
         assert rollout.terminated.any()
         assert not rollout.terminated[-1].all()
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_ratio_is_nearly_one_in_bfloat16(played, memory):
+    args, run, *_ = played(iterations=3, weights_scale=3.0, env_id="MortarMayhemB-Grid-v0", amp=True, **memory)
+    with ppo_gru.autocast(args, torch.device("cpu")):
+        _, ratio, values = recompute(run)
+    assert (ratio - 1).abs().max() < 5e-2
+    assert values.dtype == run.rollout.log_probs.dtype == torch.float32
 
 
 @pytest.mark.parametrize("memory", MEMORIES[:-1])
@@ -141,7 +150,7 @@ def test_an_episode_s_first_step_is_the_same_whatever_came_before(played, memory
     _, run, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
     agent, live = run.agent, run.play.live
     obs = {"observation": torch.randn(4, 3)}
-    fresh = agent.act(obs, agent.memory.initial(4, torch.device("cpu")))[1]
+    fresh = agent.act(obs, agent.memory.initial(4, torch.device("cpu"), 16))[1]
     forgotten = agent.memory.reset(live, torch.tensor([True, True, True, False]))
     values = agent.act(obs, forgotten)[1]
     torch.testing.assert_close(values[:3], fresh[:3], atol=1e-6, rtol=0)
@@ -168,7 +177,7 @@ def test_a_long_episode_takes_no_more_memory_than_a_short_one(played):
     args, run, *_ = played(num_envs=1, num_steps=50, num_minibatches=1, **changes)
 
     def storage():
-        parts = {**run.rollout.obs, **{k: v for k, v in vars(run.rollout).items() if k != "obs"}}
+        parts = {**run.rollout.obs, **{k: v for k, v in vars(run.rollout).items() if isinstance(v, torch.Tensor)}}
         return {name: (part.data_ptr(), part.shape, part.dtype) for name, part in parts.items()}
 
     before = storage()
@@ -209,7 +218,7 @@ def test_truncation_bootstraps_with_the_final_observation_and_the_memory_before_
     live = torch.zeros_like(rollout.memory[0])
     for t in range(5):
         *_, live, _ = run.agent.act({"observation": rollout.obs["observation"][t]}, live)
-    envs = ppo_gru.make_envs(args.env_id, args.num_envs, args.num_levels, args.start_level, False)
+    envs = ppo_gru.make_envs(args, args.num_envs)
     ppo_gru.first_reset(envs, args.seed, {"max_steps": 5})
     for t in range(5):
         *_, infos = envs.step(rollout.actions[t].numpy())
@@ -238,7 +247,7 @@ def test_an_environment_that_resets_in_the_next_step_is_refused(tiny, monkeypatc
 
 def test_autoreset_is_in_the_same_step():
     for env_id in ("MortarMayhem-Grid-v0", "CueRecall-v0", "CartPole-v1"):
-        envs = ppo_gru.make_envs(env_id, 2, 10, 0, False)
+        envs = ppo_gru.make_envs(ppo_gru.Args(env_id=env_id), 2)
         assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
         envs.close()
 

@@ -157,6 +157,26 @@ def test_interrupting_keeps_what_was_learned(tiny, monkeypatch):
     assert os.path.exists(os.path.join(folder, "model.pt"))
 
 
+def test_steps_are_counted_without_a_progress_bar(tiny):
+    code = f"import ppo_gru; ppo_gru.main(ppo_gru.{tiny(env_id='CartPole-v1')!r})"
+    environment = {**os.environ, "TQDM_DISABLE": "1", "PYTHONPATH": os.path.dirname(ppo_gru.__file__)}
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300, env=environment)
+    events = EventAccumulator(glob.glob("runs/*")[0])
+    events.Reload()
+    assert [point.step for point in events.Scalars("charts/SPS")] == [64, 128]
+
+
+def test_bfloat16_is_used_and_changes_little(tiny, scalars):
+    """A change of precision moves the curves, but not by much."""
+    changes = {"env_id": "MortarMayhem-Grid-v0", "num_steps": 8, "total_timesteps": 32}
+    for script in SCRIPTS:
+        exact, rough = (
+            scalars(script.main(tiny(script, exp_name=str(amp), amp=amp, **changes))) for amp in (False, True)
+        )
+        assert exact["losses/value_loss"] != rough["losses/value_loss"]
+        assert rough["losses/value_loss"] == pytest.approx(exact["losses/value_loss"], rel=0.2)
+
+
 def test_annealing(tiny, scalars):
     rates = {"init_lr": 1e-3, "final_lr": 1e-4, "init_ent_coef": 0.1, "final_ent_coef": 0.01}
     down = scalars(ppo_gru.main(tiny(env_id="CueRecall-v0", total_timesteps=256, anneal_steps=128, **rates)))

@@ -12,7 +12,7 @@ from gymnasium.wrappers import FrameStackObservation, TransformObservation
 from players import choices
 
 from memory_gym_envs.searing_spotlights import BEND, START, TOWARD
-from memory_gym_envs.wrappers import HEAD_START, GrayscaleStack, SpotlightPerturbation, StepEncoding, gray
+from memory_gym_envs.wrappers import HEAD_START, GrayscaleStack, SpotlightPerturbation, StepEncoding, VectorStack, gray
 
 LANES = 3
 SHORT = "Endless-MysteryPath-v0", "MortarMayhemB-Grid-v0"  # whose random episodes are; a picture and a Dict
@@ -166,6 +166,7 @@ def test_needs_a_picture(wrapper):
     [
         (GrayscaleStack, {"frames": 0}, "frames must be an integer of at least 1, not 0"),
         (GrayscaleStack, {"frames": 4.0}, "frames"),
+        (VectorStack, {}, "VectorStack needs a vector to observe, not Box"),
         (StepEncoding, {"width": 15}, "width must be an even integer of at least 2, not 15"),
         (StepEncoding, {"width": 0}, "width"),
         (SpotlightPerturbation, {"opacity": 256}, "opacity must be an integer from 0 to 255, not 256"),
@@ -225,6 +226,26 @@ def test_reset_mask_begins_its_stacks_alone():
     first, _ = bare.reset(seed=9)
     assert np.array_equal(after[[0, 2]], before[[0, 2]])
     assert np.array_equal(after[1], gray(first[1])[..., None].repeat(3, axis=-1))
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+@EACH_SHORT
+def test_vector_stack_is_gymnasiums_of_single_environments(env_id, frames):
+    def single():
+        return FrameStackObservation(gym.make(env_id, obs_type="vector"), frames)
+
+    ours, theirs, ended = VectorStack(make(env_id, obs_type="vector"), frames), sync(single), 0
+    assert np.array_equal(ours.reset(seed=3)[0], theirs.reset(seed=3)[0].reshape(LANES, -1))
+    for left, right in zip(roll(ours, 100), roll(theirs, 100), strict=True):
+        assert left[0] in ours.observation_space
+        assert np.array_equal(left[0], right[0].reshape(LANES, -1))
+        left[0].fill(1)  # the caller's own
+        for (_, last), (_, other) in zip(finals(left[4]), finals(right[4]), strict=True):
+            assert np.array_equal(last, other.flatten())
+            ended += 1
+    assert ended > LANES
+    with pytest.raises(ValueError, match="frames must be an integer of at least 1, not 0"):
+        VectorStack(make(env_id, obs_type="vector"), 0)
 
 
 def test_gray():

@@ -1,0 +1,129 @@
+"""The auxiliary heads (5.1.2, 5.1.3): what they draw and estimate, which steps they learn from, whom they teach."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional as F
+
+import ppo_gru
+import ppo_trxl
+from ppo_gru import Agent, Args, Decoder, reconstruction_loss
+
+HEADS = {"reconstruction_coef": 0.1, "ground_truth_coef": 0.1}
+SCRIPTS = pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
+
+
+def loss_of(script, args, run):
+    """The loss of a whole rollout, its logs, and the gradients that it leaves."""
+    pieces = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated)
+    zeros = torch.zeros_like(run.rollout.values)
+    run.agent.zero_grad()
+    loss, logs = script.minibatch_loss(run.agent, run.rollout, (zeros, zeros), pieces, 0.0, args)
+    loss.backward()
+    return loss.detach(), logs, {name: p.grad for name, p in run.agent.named_parameters() if p.grad is not None}
+
+
+@pytest.mark.parametrize("shape", [(84, 84, 3), (84, 84, 16), (64, 64, 1), (61, 90, 3), (36, 37, 2)])
+def test_the_decoder_draws_pictures_of_the_observation_s_size(shape):
+    decoder = Decoder(32, {"picture": gym.spaces.Box(0, 255, shape, np.uint8)})
+    assert decoder(torch.randn(2, 32)).shape == (2, *shape)
+    assert [layer.out_channels for layer in decoder if hasattr(layer, "out_channels")] == [64, 32, shape[2]]
+
+
+def test_the_decoder_is_the_encoder_turned_round():
+    decoder = Decoder(512, {"picture": gym.spaces.Box(0, 255, (84, 84, 3), np.uint8)})
+    sizes, x = [], torch.randn(1, 512)
+    for layer in decoder:
+        x = layer(x)
+        if isinstance(layer, torch.nn.ConvTranspose2d | torch.nn.Unflatten):
+            sizes.append(tuple(x.shape[1:]))
+    assert sizes == [(64, 7, 7), (64, 9, 9), (32, 20, 20), (3, 84, 84)]
+
+
+def test_reconstruction_loss_by_hand():
+    pixels = torch.tensor([[0, 255, 51]], dtype=torch.uint8)
+    drawn = torch.tensor([[0.5, 0.9, 0.2]])
+    entropy = -np.log(0.5) - np.log(0.9) - 0.2 * np.log(0.2) - 0.8 * np.log(0.8)
+    assert reconstruction_loss(torch.logit(drawn), pixels) == pytest.approx(entropy / 3, rel=1e-6)
+
+
+@SCRIPTS
+def test_the_losses_are_means_over_real_steps(played, script):
+    args, run, *_ = played(script=script, env_id="MortarMayhemB-Grid-v0", **HEADS)
+    loss, logs, _ = loss_of(script, args, run)
+    pieces = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated)
+    order = pieces.steps()
+    assert sorted(order.tolist()) == list(range(64))  # every step once, no padding
+    obs = {name: part.flatten(0, 1)[order] for name, part in run.rollout.obs.items()}
+    with torch.no_grad():
+        features = run.agent.evaluate(obs, pieces, run.rollout.memory)[2]
+        drawn = torch.sigmoid(run.agent.decoder(features))
+        wanted = obs["visual_observation"] / 255
+        truths = run.rollout.ground_truth.flatten(0, 1)[order]
+        estimate_loss = (run.agent.estimator(features) - truths).square().mean()
+    torch.testing.assert_close(logs["losses/reconstruction_loss"], F.binary_cross_entropy(drawn, wanted))
+    torch.testing.assert_close(logs["losses/ground_truth_loss"], estimate_loss)
+    parts = ("policy_loss", "value_loss", "reconstruction_loss", "ground_truth_loss")
+    policy, value, drawn, estimated = (logs[f"losses/{name}"] for name in parts)
+    torch.testing.assert_close(loss, policy + 0.5 * value + 0.1 * drawn + 0.1 * estimated)
+
+
+@SCRIPTS
+def test_the_ground_truth_belongs_to_the_observation(played, script):
+    """The same actions, played again: what the infos said when an observation was handed out."""
+    args, run, *_ = played(script=script, env_id="MortarMayhemB-Grid-v0", num_steps=32, num_minibatches=1, **HEADS)
+    envs = script.make_envs(args, args.num_envs)
+    _, infos = script.first_reset(envs, args.seed, None)
+    assert run.rollout.terminated.any()
+    for t in range(32):
+        assert run.rollout.ground_truth[t].numpy() == pytest.approx(infos["ground_truth"])
+        *_, infos = envs.step(run.rollout.actions[t, :, 0].numpy())
+
+
+@SCRIPTS
+def test_a_probe_teaches_nobody_else(played, script):
+    changes = {"script": script, "env_id": "MortarMayhem-Grid-v0", "ground_truth_coef": 10.0}
+    found = {}
+    for detach in (False, True):
+        args, run, *_ = played(**changes, ground_truth_detach=detach)
+        found[detach] = loss_of(script, args, run)[2]
+    args, run, *_ = played(script=script, env_id="MortarMayhem-Grid-v0")
+    without = loss_of(script, args, run)[2]
+    for name, gradient in without.items():
+        assert found[True][name].equal(gradient), name
+    assert not found[False]["encoder.embedding.weight"].equal(without["encoder.embedding.weight"])
+    assert found[True]["estimator.0.weight"].abs().sum() > 0
+
+
+def test_heads_that_are_off_cost_nothing(played):
+    plain = Agent(gym.spaces.Box(0, 255, (84, 84, 3), np.uint8), gym.spaces.Discrete(4), Args())
+    assert plain.decoder is plain.estimator is None
+    args, run, *_ = played(env_id="CueRecall-v0")
+    assert run.rollout.ground_truth is None
+    assert not {name for name in loss_of(ppo_gru, args, run)[1] if "reconstruction" in name or "truth" in name}
+
+
+@SCRIPTS
+def test_both_losses_fall(tiny, scalars, script):
+    changes = {"num_envs": 2, "num_steps": 16, "total_timesteps": 15 * 32, "anneal_steps": 0, "init_lr": 3e-3}
+    curves = scalars(script.main(tiny(script, env_id="MortarMayhem-Grid-v0", vf_coef=0.0, **changes, **HEADS)))
+    for name in ("reconstruction_loss", "ground_truth_loss"):
+        losses = curves[f"losses/{name}"]
+        assert np.mean(losses[-3:]) < 0.6 * losses[0], name
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"env_id": "CueRecall-v0", "ground_truth_coef": 0.1},
+            "needs an environment that has ground_truth in its info",
+        ),
+        ({"env_id": "CueRecall-v0", "reconstruction_coef": 0.1}, "needs an observation with one picture, not 0"),
+        ({"reconstruction_coef": -1.0}, "--reconstruction-coef is -1.0; it must be a number from 0"),
+    ],
+)
+def test_heads_that_cannot_be(tiny, changes, message):
+    with pytest.raises(ValueError, match=message):
+        ppo_gru.setup(tiny(**changes))

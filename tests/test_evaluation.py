@@ -1,0 +1,115 @@
+"""Evaluation: unseen levels, fresh memory, one episode a lane, and nothing of it in the training."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+import ppo_gru
+import ppo_trxl
+
+SCRIPTS = pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
+FEW = {"eval_levels": 3, "eval_repeats": 2, "num_levels": 10, "start_level": 5}
+
+
+def evaluated(script, args, run, seed=0, **changes):
+    envs = script.make_envs(args, len(script.evaluation_levels(args)))
+    torch.manual_seed(seed)
+    return script.evaluate(run.agent, envs, args, **changes)
+
+
+@SCRIPTS
+def test_levels_follow_the_training_set(tiny, script):
+    args = tiny(script, env_id="MysteryPath-Grid-v0", **FEW)
+    assert script.evaluation_levels(args) == [15, 15, 16, 16, 17, 17]
+    defaults = script.Args()
+    levels = script.evaluation_levels(defaults)
+    assert len(levels) == 150  # 6.1.3: 50 levels, three times each
+    assert min(levels) == defaults.start_level + defaults.num_levels == 100_000
+
+
+@SCRIPTS
+def test_a_lane_plays_its_level_once(played, script, monkeypatch):
+    """The same actions in single environments with the levels' seeds earn the same."""
+    args, run, *_ = played(script=script, env_id="MortarMayhemB-Grid-v0", **FEW)
+    actions, to_env_actions = [], script.to_env_actions
+    monkeypatch.setattr(
+        script, "to_env_actions", lambda *given: (actions.append(to_env_actions(*given)), actions[-1])[1]
+    )
+    found = evaluated(script, args, run)
+    assert (found["finished"] == 1).all()
+    for lane, level in enumerate(script.evaluation_levels(args)):
+        env = ppo_gru.gym.make(args.env_id)
+        env.reset(seed=level)
+        rewards, ended = [], False
+        while not ended:
+            _, reward, terminated, truncated, info = env.step(actions[len(rewards)][lane])
+            rewards.append(reward)
+            ended = terminated or truncated
+        assert found["return"][lane] == pytest.approx(sum(rewards))
+        assert found["length"][lane] == len(rewards)
+        assert found["commands_completed"][lane] == info["commands_completed"]
+
+
+def test_the_memory_is_carried_from_stretch_to_stretch(played):
+    """Episodes longer than a stretch: the window's cache, refreshed, is what it was."""
+    args, run, *_ = played(script=ppo_trxl, env_id="MysteryPath-Grid-v0", weights_scale=5.0, eval_max_steps=40, **FEW)
+    whole, short = (evaluated(ppo_trxl, args, run, memory_steps=steps) for steps in (1000, 3))
+    assert whole["length"].max() > 30
+    for name, numbers in whole.items():
+        assert np.array_equal(numbers, short[name], equal_nan=True), name
+
+
+@SCRIPTS
+def test_an_episode_that_is_cut_short(played, script):
+    args, run, *_ = played(script=script, env_id="MysteryPath-Grid-v0", eval_max_steps=7, **FEW)
+    found = evaluated(script, args, run)
+    assert set(found["finished"]) <= {0.0, 1.0}
+    cut = found["finished"] == 0
+    assert cut.any()
+    assert (found["length"][cut] == 7).all()
+
+
+@SCRIPTS
+def test_training_goes_on_as_if_there_had_been_none(tiny, scalars, script):
+    args = tiny(script, env_id="MortarMayhemB-Grid-v0", total_timesteps=4 * 64, **FEW)
+    without = scalars(script.main(args))
+    curves = scalars(script.main(dataclasses.replace(args, eval_interval=3)))
+    assert [name for name in curves if name.startswith("eval/")]
+    assert len(curves["eval/commands_completed"]) == len(curves["eval/return"]) == 2  # after three and after all four
+    for name in set(without) - {"charts/SPS"}:
+        assert curves[name] == without[name], name
+
+
+def test_other_environments_are_evaluated_too(tiny, scalars):
+    curves = scalars(ppo_gru.main(tiny(env_id="CueRecall-v0", eval_interval=1, **FEW)))
+    assert len(curves["eval/right"]) == 2
+    assert all(0 <= share <= 1 for share in curves["eval/right"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "shape"),
+    [
+        ({"env_id": "MortarMayhem-Grid-v0", "frame_stack": 4}, {"observation": (84, 84, 4)}),
+        ({"env_id": "MortarMayhem-Grid-v0", "obs_type": "vector"}, None),
+        ({"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "frame_stack": 16, "step_encoding": True}, None),
+        (
+            {"env_id": "MortarMayhemB-Grid-v0", "step_encoding": True},
+            {"visual_observation": (84, 84, 3), "vector_observation": (180,), "step_encoding": (16,)},
+        ),
+    ],
+)
+@SCRIPTS
+def test_the_minor_baselines_observe_and_train(tiny, scalars, script, changes, shape):
+    """6.2.1, and vectors: what is observed is trained on, evaluated and saved."""
+    args = tiny(script, eval_interval=2, **FEW, **changes, eval_max_steps=5)
+    envs = script.make_envs(args, 2)
+    parts = {name: part.shape for name, part in script.observation_spaces(envs.single_observation_space).items()}
+    assert shape is None or parts == shape
+    assert len(scalars(script.main(args))["eval/return"]) == 1
+
+
+def test_only_memory_gym_has_vectors_to_choose(tiny):
+    with pytest.raises(ValueError, match="--obs-type is of Memory Gym environments; CartPole-v1 has one kind"):
+        ppo_gru.setup(tiny(env_id="CartPole-v1", obs_type="vector"))
