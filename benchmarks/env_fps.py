@@ -3,9 +3,9 @@
     python benchmarks/env_fps.py [--seconds S] [--num-envs N] [--many-envs M] [--ids ID ...]
 
 Prints two Markdown tables, of frames and of vector observations, both beside memory-gym's one environment. Actions are
-random, resets included. memory-gym is optional: without it, its columns are empty. Machines are noisy: seconds are those
-of the processor's time for this process, which what else is running takes no part of; the measurements of the two
-packages take turns, and each column shows the best of its rounds. Ratios are what to quote.
+random, resets included. memory-gym is optional: without it, its columns are empty. Because machines are noisy, seconds
+are the processor's time for this process, without that of other programs, the measurements of the two packages take
+turns, and each column shows the best of its rounds. Ratios are what to quote.
 """
 
 import argparse

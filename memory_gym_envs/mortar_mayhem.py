@@ -550,9 +550,11 @@ class MortarMayhem(MemoryGymVectorEnv):
             # An agent that is no wider than a tile cannot hide one.
             self._large = any(2 * figure.reach > TILE for figure in self.figures)
 
-    def begin(self, lane: int, rng: np.random.Generator) -> None:
-        """Draws the lane's next level and starts its episode."""
-        write_level(self.state, lane, draw_level(rng, self.settings[lane], self.variant), self.variant)
+    def begin(self, lanes: np.ndarray) -> None:
+        """Draws the lanes' next levels and starts their episodes."""
+        for lane in lanes.tolist():
+            level = draw_level(self._rngs[lane], self.settings[lane], self.variant)
+            write_level(self.state, lane, level, self.variant)
         self._clues_open = self.variant.clue
 
     def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1127,15 +1127,16 @@ class SearingSpotlights(MemoryGymVectorEnv):
             handed=np.array([int(10 * values["agent_scale"]) > 0 for values in self.settings]),
         )
 
-    def begin(self, lane: int, rng: np.random.Generator) -> None:
-        """Draws the lane's next level and starts its episode."""
-        values = self.settings[lane]
-        spawns = NO_LIMIT if self.variant.endless else _limit(values["num_spawns"])
-        level = draw_level(rng, values, self.variant)
-        write_level(self.state, lane, level, spawns)
-        self._furnish(lane)
-        if not level.coins:
-            self._unlocked.append(lane)
+    def begin(self, lanes: np.ndarray) -> None:
+        """Draws the lanes' next levels and starts their episodes."""
+        for lane in lanes.tolist():
+            values = self.settings[lane]
+            spawns = NO_LIMIT if self.variant.endless else _limit(values["num_spawns"])
+            level = draw_level(self._rngs[lane], values, self.variant)
+            write_level(self.state, lane, level, spawns)
+            self._furnish(lane)
+            if not level.coins:
+                self._unlocked.append(lane)
 
     def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One step of the rules: walk, spawn, shine, burn, collect, leave."""
