@@ -736,8 +736,6 @@ class Gauges(NamedTuple):
     width: int  # of a vector
     at: dict[str, slice]  # where its entries are
     places: slice  # where those on the bodies' places are
-    tiles: slice  # where those on tiles are
-    tile_share: np.ndarray  # (1, 49) or (1, 98): what each bit of a sample is of its tile
     bars: np.ndarray
     readings: np.ndarray
     shapes: (
@@ -882,7 +880,7 @@ def describe_rest(s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, 
     out[whole, g.at["facing"].start + s.look[lanes][whole]] = 1
     if "exit" in g.at:
         out[:, g.at["exit_open"].start] = s.is_open[lanes] * any_[EXIT]
-    describe_tiles(g, seen, bright, out)
+    describe_tiles(g, seen, any_[:bodies], bright, out)
 
 
 def describe_places(g: Gauges, seen: np.ndarray, any_: np.ndarray, out: np.ndarray) -> None:
@@ -901,15 +899,15 @@ def describe_places(g: Gauges, seen: np.ndarray, any_: np.ndarray, out: np.ndarr
     out[:, g.places].reshape(n, kinds, 3)[lane, body] = total
 
 
-def describe_tiles(g: Gauges, seen: np.ndarray, bright: np.ndarray, out: np.ndarray) -> None:
-    """Writes which share of each tile shows coins (not in the endless id) and light."""
-    kinds, n = g.coin, len(bright)
-    lines = np.empty((n, kinds, LINES), np.uint64)
-    if kinds > 1:
-        np.bitwise_or.reduce(seen[g.coin :], axis=0, out=lines[:, 0])
-    lines[:, -1] = bright
-    counts = tile_counts(lines.reshape(-1, LINES)).reshape(n, -1)
-    np.multiply(counts, g.tile_share, out=out[:, g.tiles])
+def describe_tiles(g: Gauges, seen: np.ndarray, any_: np.ndarray, bright: np.ndarray, out: np.ndarray) -> None:
+    """Writes which share of each tile shows light and coins (not in the endless id). any_: (K, n) whether any shows."""
+    if "coins" not in g.at:
+        out[:, g.at["light"]] = tile_counts(bright) * TILE_SHARE
+        return
+    (lanes,) = any_[g.coin :].any(axis=0).nonzero()
+    coins = np.bitwise_or.reduce(seen[g.coin :, lanes], axis=0)
+    share = tile_counts(np.concatenate([bright, coins])) * TILE_SHARE
+    out[:, g.at["light"]], out[lanes, g.at["coins"]] = share[: len(bright)], share[len(bright) :]
 
 
 def rims_left(scene: Scene) -> np.ndarray:
@@ -1114,8 +1112,6 @@ class SearingSpotlights(MemoryGymVectorEnv):
             width=at["alarm"].stop,
             at=at,
             places=slice(at["agent"].start, at["coin"].stop),
-            tiles=slice(at["coins" if "coins" in at else "light"].start, at["light"].stop),
-            tile_share=np.tile(TILE_SHARE, 1 if self.variant.endless else 2),
             bars=bars(self.variant.endless),
             readings=readings(self.variant.endless),
             shapes=shapes,
