@@ -1380,12 +1380,16 @@ def iterate(args: Args, run: Run, step: int) -> tuple[dict[str, float], dict[str
 
 
 def evaluation_scalars(run: Run, args: Args) -> dict[str, float]:
-    """Return the means over an evaluation's episodes; training goes on as if there had been none."""
+    """Return the means over an evaluation's episodes; training goes on as if there had been none.
+
+    What only an episode's end tells has no mean if an episode was cut short: the best ones would be left out.
+    """
     device = run.rollout.values.device
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(args.seed)
         found = evaluate(run.agent, run.eval_envs, args)
-    return {f"eval/{name}": float(np.nanmean(values)) for name, values in found.items()}
+    told = {name: values for name, values in found.items() if not np.isnan(values).any()}  # by every episode
+    return {f"eval/{name}": float(np.mean(values)) for name, values in told.items()}
 
 
 def main(args: Args) -> str:

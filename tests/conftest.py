@@ -21,7 +21,7 @@ SMALL = {
 }
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def tiny():
     """Arguments of a script for a training of two short iterations; keyword arguments replace some of them."""
 

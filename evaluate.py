@@ -1,0 +1,386 @@
+"""Score trained agents on levels that they have never seen, or draw their sample-efficiency curves.
+
+    python evaluate.py runs/*/model.pt --json scores.json
+    python evaluate.py --curves runs/* --out docs/curves
+
+Runs whose arguments differ in nothing but the seed are the seeds of one agent. As in the thesis (6.1.2, 6.1.3), every
+seed plays 50 levels outside its training set, three times each. An agent's score is the interquartile mean (IQM): the
+mean of the middle half of what its seeds scored on the levels. The 95 % interval is a stratified bootstrap's over the
+seeds: how far the IQM would move with other seeds. A single seed cannot tell, and has none.
+
+Shape letters: R seeds (training runs) of an agent, M levels, P points of a curve, B bootstrap resamples.
+"""
+
+import contextlib
+import itertools
+import json
+import os
+import sys
+import textwrap
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from types import ModuleType
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tqdm import tqdm
+
+import ppo_gru
+import ppo_trxl
+
+try:
+    from matplotlib import color_sequences
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
+    from scipy.stats import trim_mean
+except ImportError as error:
+    raise SystemExit(f'evaluate.py needs {error.name}: pip install -e ".[eval]"') from None
+
+SCRIPTS = {"ppo_gru": ppo_gru, "ppo_trxl": ppo_trxl}
+# A family's own metric (6.1.3), by the beginning of the id; any other environment's is the return.
+OWN_METRIC = {
+    "MortarMayhem": "commands_completed",
+    "Endless-MortarMayhem": "commands_completed",
+    "MysteryPath": "success",
+    "SearingSpotlights": "success",
+    "Endless-SearingSpotlights": "coins_collected",
+}
+# Arguments that say how a run was started and recorded, not what learned.
+BOOKKEEPING = {"seed", "torch_deterministic", "cuda", "track", "wandb_project_name", "wandb_entity", "capture_video"}
+BOOKKEEPING |= {"save_model", "eval_interval", "eval_levels", "eval_repeats", "eval_max_steps"}
+RESAMPLES = 2000
+POINTS = 200  # of a curve; one that has more is averaged over neighbours
+
+
+@dataclass
+class Config:
+    """Score checkpoints on unseen levels, or draw the curves of training runs."""
+
+    checkpoints: tyro.conf.Positional[tuple[str, ...]] = ()
+    """model.pt files that --save-model wrote"""
+    levels: int = 50
+    """levels to play, from start_level + num_levels on: those that follow the training levels (an agent that trained
+    without a limit, --num-levels 0, has met none of the numbered levels)"""
+    repeats: int = 3
+    """how often to play each level"""
+    max_steps: int = 10_000
+    """steps after which an endless episode is cut short"""
+    seed: int = 1
+    """seed of the actions"""
+    cuda: bool = True
+    """play on the GPU when there is one"""
+    json: str | None = None
+    """write the scores to this file too, down to each seed's mean on each level"""
+
+    curves: tuple[str, ...] = ()
+    """run folders whose curves to draw, instead of playing"""
+    out: str = "curves"
+    """draw to OUT.png and OUT.svg"""
+    metrics: tuple[str, ...] = ()
+    """what to show, e.g. return success (by default the family's own metric, when playing also return and length)"""
+
+
+# ---- STATISTICS ----
+def iqm(scores: np.ndarray) -> np.ndarray:
+    """Return the interquartile mean (...) of scores (..., R, M): the mean without the lowest and the highest quarter.
+
+    As many are left out as fit whole into a quarter: with three scores none, with five the lowest and the highest.
+    """
+    return trim_mean(scores.reshape(*scores.shape[:-2], -1), 0.25, axis=-1)
+
+
+def interval(scores: np.ndarray) -> np.ndarray | None:
+    """Return the ends (2, ...) of the IQM's 95 % bootstrap interval for scores (..., R, M); None for a single seed.
+
+    Levels are the strata: a resample has R scores of each. A drawn seed brings its scores on all levels along, for they
+    come from the same weights. To draw anew for each level is right where each has been trained on by itself; here it
+    makes the interval far too narrow wherever seeds differ, as benchmarks/interval_coverage.py shows.
+    """
+    seeds = scores.shape[-2]
+    if seeds < 2:
+        return None
+    drawn = np.random.default_rng(0).integers(seeds, size=(RESAMPLES, seeds))  # (B, R)
+    return np.percentile(iqm(scores[..., drawn, :]), [2.5, 97.5], axis=-1)  # of (..., B, R, M)
+
+
+def summary(agent: str, paths: list[str], scores: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Return what to report of an agent, for JSON: scores (R, M) by metric, paths in the order of the seeds."""
+    metrics = {}
+    for name, values in scores.items():
+        ends = interval(values)
+        metrics[name] = {
+            "mean": float(values.mean()),
+            "iqm": float(iqm(values)),
+            "interval": None if ends is None else ends.tolist(),
+            "scores": values.tolist(),
+        }
+    return {"agent": agent, "runs": paths, "metrics": metrics}
+
+
+def table(agents: list[dict[str, Any]]) -> str:
+    """Return the summaries as a Markdown table, the agents below each other for every metric."""
+    lines = ["| metric | agent | seeds | mean | IQM | 95 % interval |", "|---|---|---:|---:|---:|---|"]
+    for metric in agents[0]["metrics"]:
+        for agent in agents:
+            score = agent["metrics"][metric]
+            ends = "none: one seed" if score["interval"] is None else "{:.3f} to {:.3f}".format(*score["interval"])
+            cells = (metric, agent["agent"], len(agent["runs"]), f"{score['mean']:.3f}", f"{score['iqm']:.3f}", ends)
+            lines.append("| {} | {} | {} | {} | {} | {} |".format(*cells))
+    return "\n".join(lines)
+
+
+# ---- AGENTS ----
+def task_of(args: dict[str, Any]) -> str:
+    """Name what was learned: runs of another environment, or with other reset parameters, do not compare."""
+    return args["env_id"] if args["env_options"] == "{}" else f"{args['env_id']} {args['env_options']}"
+
+
+def own_metric(env_id: str) -> str:
+    """Return the name of the environment's own metric."""
+    name = env_id.rpartition(":")[2]
+    return next((metric for start, metric in OWN_METRIC.items() if name.startswith(start)), "return")
+
+
+def tasks_of(runs: dict[str, dict[str, Any]], title: Callable) -> dict[str, dict[str, list[str]]]:
+    """Sort runs, arguments by path, into tasks and agents: the paths of an agent's seeds by title and label."""
+    tasks = defaultdict(dict)
+    for path, args in runs.items():
+        tasks[title(args)][path] = args
+    return {name: agents_of(members) for name, members in tasks.items()}
+
+
+def agents_of(runs: dict[str, dict[str, Any]]) -> dict[str, list[str]]:
+    """Put the runs that differ in nothing but the seed together; runs: their arguments by path.
+
+    Raises ValueError if two of them have the same seed too, since they tell no more than one.
+    """
+    agents = defaultdict(dict)
+    for path, args in runs.items():
+        seeds = agents[tuple(sorted((k, v) for k, v in args.items() if k not in BOOKKEEPING))]
+        if args["seed"] in seeds:
+            twin = seeds[args["seed"]]
+            raise ValueError(f"{path} is the same agent and seed, {args['seed']}, as {twin}; leave one of them out")
+        seeds[args["seed"]] = path
+    members = [list(seeds.values()) for seeds in agents.values()]
+    return dict(zip(labels([runs[paths[0]] for paths in members]), members, strict=True))
+
+
+def labels(agents: list[dict[str, Any]]) -> list[str]:
+    """Name each agent by exp_name, and if these are not all different, by the arguments that are."""
+    names = [args["exp_name"] for args in agents]
+    if len(set(names)) == len(names):
+        return names
+    keys = dict.fromkeys(key for args in agents for key in args if key not in BOOKKEEPING)
+    differ = [key for key in keys if len({args[key] for args in agents if key in args}) > 1]
+    bare = {"exp_name", "script"}
+    words = [[args[k] if k in bare else f"{k}={args[k]}" for k in differ if k in args] for args in agents]
+    return [" ".join(dict.fromkeys(each)) for each in words]
+
+
+# ---- CURVES ----
+def read_run(folder: str) -> EventAccumulator:
+    """Read a run folder's TensorBoard file; raise ValueError if there is none or it holds no curves."""
+    if not os.path.isdir(folder):
+        raise ValueError(f"there is no run folder {folder}")
+    events = EventAccumulator(folder, size_guidance={"scalars": 0})
+    events.Reload()
+    tags = events.Tags()
+    if not tags["scalars"] or "hyperparameters/text_summary" not in tags["tensors"]:
+        raise ValueError(f"{folder} holds no curves of a training run")
+    return events
+
+
+def hyperparameters(events: EventAccumulator) -> dict[str, str]:
+    """Return a run's arguments as text, from the Markdown table in its TensorBoard file.
+
+    An argument that is younger than the run has its default, one that no longer exists is left out.
+    """
+    rows = events.Tensors("hyperparameters/text_summary")[0].tensor_proto.string_val[0].decode().splitlines()[2:]
+    given = dict(row[1:-1].split("|", 1) for row in rows)
+    script = ppo_trxl if "trxl_dim" in given else ppo_gru
+    return {"script": script.__name__} | {name: given.get(name, str(v)) for name, v in asdict(script.Args()).items()}
+
+
+def curve_name(metric: str, runs: list[EventAccumulator]) -> str:
+    """Return the scalar that shows the metric in every one of the runs, of evaluations rather than training episodes.
+
+    Raises ValueError if there is none.
+    """
+    common = set.intersection(*(set(run.Tags()["scalars"]) for run in runs))
+    for name in (metric, f"eval/{metric}", f"episode/{metric}", f"charts/episodic_{metric}"):
+        if name in common:
+            return name
+    known = ", ".join(sorted(name for name in common if name.startswith(("eval/", "episode/", "charts/episodic_"))))
+    raise ValueError(f"the runs have no curve of {metric} in common; they all have {known or 'none of an episode yet'}")
+
+
+def read_curve(run: EventAccumulator, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the steps and values of a scalar, without those that are no number; raise ValueError if none is."""
+    points = [(point.step, point.value) for point in run.Scalars(name) if np.isfinite(point.value)]
+    if not points:
+        raise ValueError(f"{run.path} has no number in its curve of {name}")
+    steps, values = np.array(points).T
+    return steps, values
+
+
+def align(runs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Bring curves (steps, values) to common steps (P,): return these and scores (P, R, 1).
+
+    The steps are those of all runs, as far as every run reaches; between its own, a run's values are interpolated. More
+    than POINTS become so many by the mean of neighbours. Raises ValueError if runs have no steps in common.
+    """
+    first, last = max(steps[0] for steps, _ in runs), min(steps[-1] for steps, _ in runs)
+    if first > last:
+        raise ValueError("the curves of an agent's seeds have no steps in common; leave out the shortest run")
+    steps = np.unique(np.concatenate([steps for steps, _ in runs]))
+    steps = steps[(first <= steps) & (steps <= last)]
+    values = np.stack([np.interp(steps, *run) for run in runs], axis=-1)  # (all steps, R)
+    parts = np.array_split(np.arange(len(steps)), min(len(steps), POINTS))
+    scores = np.stack([values[part].mean(0) for part in parts])[..., None]  # (P, R, 1)
+    return np.array([steps[part].mean() for part in parts]), scores
+
+
+def draw_metric(axis: Axes, name: str, agents: dict[str, list[EventAccumulator]]) -> dict[str, np.ndarray]:
+    """Draw a scalar of every agent, its runs by label; return each one's last scores (R, 1)."""
+    last = {}
+    for (label, runs), color in zip(agents.items(), itertools.cycle(color_sequences["petroff10"]), strict=False):
+        steps, scores = align([read_curve(run, name) for run in runs])
+        marker = "o" if len(steps) == 1 else None  # a line of one point is not to be seen
+        seeds = f"{len(runs)} seed{'s' * (len(runs) > 1)}"
+        axis.plot(steps, iqm(scores), color=color, marker=marker, label=f"{label}, {seeds}")
+        if (band := interval(scores)) is not None:
+            axis.fill_between(steps, *band, color=color, alpha=0.2, linewidth=0)
+        last[label] = scores[-1]
+    axis.set(xlabel="steps", ylabel=name)
+    axis.xaxis.set_major_formatter(EngFormatter(sep=" "))
+    axis.grid(alpha=0.3)
+    return last
+
+
+def draw_curves(config: Config) -> list[dict[str, Any]]:
+    """Draw a row of pictures for each task, a column for each metric; print where the curves end, and return it."""
+    events = {path: read_run(path) for path in dict.fromkeys(config.curves)}
+    args = {path: hyperparameters(run) for path, run in events.items()}
+    tasks = tasks_of(args, task_of)
+    columns = len(config.metrics) or 1
+    figure = Figure(figsize=(5.5 * columns, 4 * len(tasks)), layout="constrained")
+    report = []
+    for axes, (title, agents) in zip(figure.subplots(len(tasks), columns, squeeze=False), tasks.items(), strict=True):
+        runs = {label: [events[path] for path in paths] for label, paths in agents.items()}
+        last = defaultdict(dict)
+        env_id = next(args[path]["env_id"] for paths in agents.values() for path in paths)
+        for axis, metric in zip(axes, config.metrics or [own_metric(env_id)], strict=True):
+            name = curve_name(metric, list(itertools.chain(*runs.values())))
+            for label, scores in draw_metric(axis, name, runs).items():
+                last[label][name] = scores
+        axes[0].set_title(textwrap.fill(title, 55 * columns), loc="left", fontsize="medium")
+        axes[0].legend(loc="upper left", bbox_to_anchor=(0, -0.17), frameon=False)  # below, clear of the curves
+        report.append({"task": title, "agents": [summary(label, agents[label], last[label]) for label in agents]})
+        print(f"{title}, where the curves end\n\n{table(report[-1]['agents'])}\n")
+    for name in (f"{config.out}.png", f"{config.out}.svg"):
+        figure.savefig(name, dpi=150)
+    return report
+
+
+# ---- SCORES ----
+def load(path: str, config: Config) -> tuple[ModuleType, Any]:
+    """Return the script that trained a checkpoint, and its arguments with this evaluation's settings.
+
+    Raises ValueError if the file is no checkpoint, OSError if it cannot be read.
+    """
+    script = ppo_gru  # whose load_model says what is wrong with a file that tells no script
+    with contextlib.suppress(Exception):
+        script = SCRIPTS[torch.load(path, map_location="cpu", weights_only=True)["script"]]
+    args, _ = script.load_model(path)
+    settings = {"eval_levels": config.levels, "eval_repeats": config.repeats, "eval_max_steps": config.max_steps}
+    return script, replace(args, cuda=config.cuda, **settings)
+
+
+def play(path: str, script: ModuleType, args: Any, seed: int) -> dict[str, np.ndarray]:
+    """Let a checkpoint's agent play the levels; return numbers (M,) by name, each level's mean over its repeats.
+
+    Raises what the script raises for an environment that is not there or weights that do not fit.
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
+    envs = script.make_envs(args, args.eval_levels * args.eval_repeats)
+    _, infos = envs.reset(options=script.reset_options(args.env_id, args.env_options))
+    agent = script.make_agent(envs, infos, args, device)
+    script.load_weights(agent, path)
+    torch.manual_seed(seed)
+    found = script.evaluate(agent, envs, args)
+    envs.close()
+    return {name: numbers.reshape(args.eval_levels, args.eval_repeats).mean(1) for name, numbers in found.items()}
+
+
+def title_of(args: dict[str, Any]) -> str:
+    """Name the task and the levels of it that are played."""
+    first = args["start_level"] + args["num_levels"]
+    return f"{task_of(args)}, levels {first} to {first + args['eval_levels'] - 1}, {args['eval_repeats']} times each"
+
+
+def choose_metrics(wanted: tuple[str, ...], env_id: str, played: list[dict[str, np.ndarray]]) -> list[str]:
+    """Return the metrics to report: those wanted, else the family's own, return, length and falls.
+
+    Only what every episode told can be averaged; one that was cut short tells return and length so far, and no more.
+    Raises ValueError for a wanted metric that they did not all tell.
+    """
+    known = [name for name in played[0] if all(name in each and not np.isnan(each[name]).any() for each in played)]
+    if unknown := [name for name in wanted if name not in known]:
+        raise ValueError(f"not every episode told {unknown[0]}; they told {', '.join(known)}")
+    usual = dict.fromkeys([own_metric(env_id), "return", "length", "num_fails"])
+    return list(wanted) or [name for name in usual if name in known]
+
+
+def score_checkpoints(config: Config) -> list[dict[str, Any]]:
+    """Play the levels with every checkpoint's agent; print a table for each task, and return what is in it."""
+    models = {path: load(path, config) for path in dict.fromkeys(config.checkpoints)}
+    arguments = {path: {"script": script.__name__, **asdict(args)} for path, (script, args) in models.items()}
+    tasks = tasks_of(arguments, title_of)
+    played = {path: play(path, *model, config.seed) for path, model in tqdm(models.items(), unit=" agents")}
+    report = []
+    for title, agents in tasks.items():
+        paths = list(itertools.chain(*agents.values()))
+        metrics = choose_metrics(config.metrics, arguments[paths[0]]["env_id"], [played[path] for path in paths])
+        summaries = []
+        for label, members in agents.items():
+            scores = {name: np.stack([played[path][name] for path in members]) for name in metrics}  # (R, M) each
+            summaries.append(summary(label, members, scores))
+        finished = float(np.mean([played[path]["finished"] for path in paths]))
+        report.append({"task": title, "finished": finished, "agents": summaries})
+        print(f"{title}\n\n{table(summaries)}\n")
+        if finished < 1:
+            print(f"--max-steps cut {1 - finished:.2%} of the episodes; what only their end tells is left out\n")
+    return report
+
+
+def main(config: Config) -> None:
+    """Do what the command line asks for.
+
+    Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
+    """
+    if bool(config.checkpoints) == bool(config.curves):
+        raise ValueError("give either checkpoints to play with (runs/*/model.pt), or --curves and run folders (runs/*)")
+    for name, low in (("levels", 1), ("repeats", 1), ("max_steps", 1), ("seed", 0)):
+        if getattr(config, name) < low:
+            raise ValueError(f"{ppo_gru.flag(name)} is {getattr(config, name)}; it must be {low} or more")
+    for path in (config.json, config.out):
+        if path is not None and not os.path.isdir(os.path.dirname(path) or "."):
+            raise ValueError(f"there is no folder {os.path.dirname(path)} to write to")
+    report = draw_curves(config) if config.curves else score_checkpoints(config)
+    if config.json is not None:
+        with open(config.json, "w") as file:
+            json.dump(report, file, indent=1)
+
+
+if __name__ == "__main__":
+    config = tyro.cli(Config)
+    try:
+        main(config)
+    except (ValueError, OSError, ImportError, gym.error.Error) as error:
+        sys.exit(f"evaluate.py: {' '.join(str(error).split())}")

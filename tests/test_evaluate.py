@@ -1,0 +1,295 @@
+"""Scores and curves of trained agents: the statistics by hand, what is grouped, and the commands end to end."""
+
+import itertools
+import json
+import subprocess
+import sys
+import xml.etree.ElementTree
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+from PIL import Image
+from torch.utils.tensorboard import SummaryWriter
+
+import evaluate
+import memory_gym_envs
+import ppo_gru
+import ppo_trxl
+
+TASK = {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "num_levels": 10, "start_level": 5, "save_model": True}
+FEW = {"levels": 4, "repeats": 2, "cuda": False}
+
+
+# ---- statistics ----
+@pytest.mark.parametrize(
+    ("scores", "middle"),
+    [
+        ([[1], [2], [6]], 3),  # a quarter of three is not even one
+        ([[0], [1], [2], [100]], 1.5),
+        ([[0], [1], [2], [3], [100]], 2),
+        ([[5, 0], [100, 7]], 6),  # seeds and levels alike
+        ([[9, 1, 2, 3], [4, 5, 6, 50]], 4.5),
+    ],
+)
+def test_interquartile_mean(scores, middle):
+    assert evaluate.iqm(np.array(scores, float)) == middle
+
+
+def test_interval_by_hand():
+    """The IQM of four is the mean of the middle two: 0 if at least three are the worst seed's (5 %)."""
+    assert evaluate.interval(np.array([[0.0], [4.0], [8.0], [100.0]])).tolist() == [0, 100]
+    # Two seeds, drawn whole: both the bad one (25 %), or both the good one (25 %). Drawn anew for each of the six
+    # levels, an IQM of 0 would need at least nine of twelve to be bad (7 %), one of 1 as many good ones.
+    assert evaluate.interval(np.array([[0.0] * 6, [1.0] * 6])).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("scores", [[[0, 2], [4, 10], [5, 6], [1, 9]], [[0], [0], [3], [4], [8]]])
+def test_interval_is_that_of_all_resamples(scores):
+    def middle(values):
+        quarter = len(values) // 4
+        return np.mean(sorted(values)[quarter : len(values) - quarter])
+
+    drawn = itertools.product(scores, repeat=len(scores))
+    every = [middle([score for seed in seeds for score in seed]) for seeds in drawn]
+    low, high = np.quantile(every, [0.025, 0.975])
+    assert min(every) < high < max(every), "the case tells the 95 % interval from the whole range"
+    assert evaluate.interval(np.array(scores, float)) == pytest.approx([low, high])
+
+
+def test_interval_for_every_point_of_a_curve():
+    scores = np.random.default_rng(1).normal(size=(3, 5, 4))
+    each = np.stack([evaluate.interval(point) for point in scores], axis=-1)
+    assert np.array_equal(evaluate.interval(scores), each)
+    assert each.shape == (2, 3)
+
+
+def test_one_seed_has_no_interval():
+    assert evaluate.interval(np.zeros((1, 50))) is None
+    summary = evaluate.summary("gru", ["a"], {"return": np.array([[1.0, 2.0, 3.0, 4.0]])})
+    assert summary["metrics"]["return"]["interval"] is None
+    assert evaluate.table([summary]).splitlines()[-1] == "| return | gru | 1 | 2.500 | 2.500 | none: one seed |"
+
+
+# ---- agents ----
+def arguments(script="ppo_gru", **changes):
+    return {"script": script, "exp_name": script, "env_id": "MysteryPath-v0", "env_options": "{}", "seed": 1} | changes
+
+
+def test_seeds_of_an_agent_are_found():
+    runs = {
+        "a": arguments(memory="gru"),
+        "b": arguments(memory="none"),
+        "c": arguments(memory="gru", seed=2, track=True),
+        "d": arguments("ppo_trxl", trxl_dim=32),
+        "e": arguments("ppo_trxl", trxl_dim=32, seed=5),
+    }
+    assert evaluate.agents_of(runs) == {
+        "ppo_gru memory=gru": ["a", "c"],
+        "ppo_gru memory=none": ["b"],
+        "ppo_trxl": ["d", "e"],
+    }
+
+
+def test_own_names_of_agents():
+    runs = {"a": arguments(exp_name="mine", gamma=0.9), "b": arguments(exp_name="yours", gamma=0.5)}
+    assert set(evaluate.agents_of(runs)) == {"mine", "yours"}
+    runs = {"a": arguments(exp_name="mine"), "b": arguments("ppo_trxl", exp_name="mine")}
+    assert set(evaluate.agents_of(runs)) == {"ppo_gru", "ppo_trxl"}
+    runs = {"a": arguments(gamma=0.9), "b": arguments(gamma=0.5, exp_name="new"), "c": arguments(gamma=0.5)}
+    assert set(evaluate.agents_of(runs)) == {"ppo_gru gamma=0.9", "new gamma=0.5", "ppo_gru gamma=0.5"}
+
+
+def test_the_same_seed_twice_is_refused():
+    with pytest.raises(ValueError, match="b is the same agent and seed, 1, as a; leave one of them out"):
+        evaluate.agents_of({"a": arguments(), "b": arguments(cuda=False)})
+
+
+def test_other_tasks_are_apart():
+    other = arguments(env_options='{"show_goal": [true]}')
+    tasks = evaluate.tasks_of({"a": arguments(), "b": other, "c": arguments(seed=2)}, evaluate.task_of)
+    assert tasks == {
+        "MysteryPath-v0": {"ppo_gru": ["a", "c"]},
+        'MysteryPath-v0 {"show_goal": [true]}': {"ppo_gru": ["b"]},
+    }
+
+
+@pytest.mark.parametrize("env_id", memory_gym_envs.IDS)
+def test_own_metric_is_told_by_the_environment(env_id):
+    """6.1.3; the return is told by every evaluation."""
+    metric = evaluate.own_metric(env_id)
+    envs = ppo_gru.gym.make_vec(env_id, num_envs=1)
+    envs.reset(seed=0)
+    assert metric in envs.summary(np.array([0])) or (metric, env_id) == ("return", "Endless-MysteryPath-v0")
+
+
+# ---- curves ----
+def test_curves_on_common_steps():
+    steps, scores = evaluate.align(
+        [(np.array([0, 10, 20]), np.array([0.0, 1.0, 3.0])), (np.array([5, 15]), np.array([4.0, 8.0]))]
+    )
+    assert steps.tolist() == [5, 10, 15]
+    assert scores[..., 0].tolist() == [[0.5, 4], [1, 6], [2, 8]]
+
+
+def test_dense_curves_are_averaged():
+    steps = np.arange(1, 10 * evaluate.POINTS + 1)
+    common, scores = evaluate.align([(steps, steps * 2.0)])
+    assert len(common) == evaluate.POINTS
+    assert common[0] == 5.5  # of 1 to 10
+    assert np.array_equal(scores[:, 0, 0], common * 2)
+
+
+def test_curves_without_common_steps():
+    with pytest.raises(ValueError, match="no steps in common"):
+        evaluate.align([(np.array([1, 2]), np.zeros(2)), (np.array([3]), np.zeros(1))])
+
+
+@pytest.fixture(scope="module")
+def agents(tiny, tmp_path_factory):
+    """The run folders of two seeds of two agents, trained for two iterations with an evaluation after each."""
+    settings = {**TASK, "num_steps": 128, "total_timesteps": 1024, "eval_interval": 1, "eval_levels": 2}
+    folder = tmp_path_factory.mktemp("agents")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        each = itertools.product((ppo_gru, ppo_trxl), (1, 2))
+        return [str(folder / script.main(tiny(script, seed=seed, **settings))) for script, seed in each]
+
+
+def test_curves_drawn(agents, scalars, capsys):
+    evaluate.main(evaluate.Config(curves=tuple(agents), metrics=("length", "losses/entropy"), json="ends.json"))
+    assert Image.open("curves.png").size[0] > 1000
+    assert xml.etree.ElementTree.parse("curves.svg").getroot().tag.endswith("svg")
+    (task,) = json.loads(Path("ends.json").read_text())
+    assert [agent["agent"] for agent in task["agents"]] == ["ppo_gru", "ppo_trxl"]
+    ends = [scalars(folder)["eval/length"][-1] for folder in agents[:2]]
+    assert task["agents"][0]["metrics"]["eval/length"]["mean"] == pytest.approx(np.mean(ends))
+    assert "| eval/length | ppo_gru | 2 |" in capsys.readouterr().out
+
+
+def test_a_curve_is_the_iqm_with_its_band(agents, scalars):
+    runs = {"gru": [evaluate.read_run(folder) for folder in agents[:2]], "trxl": [evaluate.read_run(agents[2])]}
+    axis = Figure().subplots()
+    evaluate.draw_metric(axis, "losses/entropy", runs)
+    curves = np.stack([scalars(folder)["losses/entropy"] for folder in agents])
+    gru, trxl = axis.lines
+    assert np.allclose(gru.get_ydata(), curves[:2].mean(0))  # a quarter of two seeds is none
+    assert np.allclose(trxl.get_ydata(), curves[2])
+    assert gru.get_xdata().tolist() == [512, 1024]
+    assert gru.get_color() != trxl.get_color()
+    (band,) = axis.collections  # a single seed has none
+    low, high = band.get_paths()[0].get_extents().intervaly
+    assert (low, high) == pytest.approx((curves[:2].min(), curves[:2].max()))
+    assert axis.get_legend_handles_labels()[1] == ["gru, 2 seeds", "trxl, 1 seed"]
+
+
+def test_hyperparameters_are_those_of_the_run(agents):
+    for folder in agents:
+        script = ppo_trxl if "trxl" in folder else ppo_gru
+        args, _ = script.load_model(f"{folder}/model.pt")
+        text = {name: str(value) for name, value in asdict(args).items()}
+        assert evaluate.hyperparameters(evaluate.read_run(folder)) == {"script": script.__name__} | text
+
+
+def test_evaluations_are_shown_before_training_episodes(agents):
+    runs = [evaluate.read_run(folder) for folder in agents]
+    assert evaluate.curve_name("length", runs) == "eval/length"
+    assert evaluate.curve_name("episode/length", runs[:1]) == "episode/length"
+
+
+def test_the_arguments_of_an_older_run():
+    """What it could not say has the default, so that it still counts as a seed of the same agent."""
+    with SummaryWriter("old") as writer:
+        writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|3|\n|num_envs|4|\n|no_longer|1|\n|env_id|A-v0|")
+        writer.add_scalar("eval/return", float("nan"), 5)
+        writer.add_scalar("eval/return", 2.0, 10)
+    run = evaluate.read_run("old")
+    defaults = {name: str(value) for name, value in asdict(ppo_gru.Args()).items()}
+    changed = {"script": "ppo_gru", "seed": "3", "num_envs": "4", "env_id": "A-v0"}
+    assert evaluate.hyperparameters(run) == defaults | changed
+    assert [each.tolist() for each in evaluate.read_curve(run, "eval/return")] == [[10], [2]]
+
+
+# ---- scores ----
+def test_scores_are_those_of_the_levels(agents, capsys):
+    models = tuple(f"{folder}/model.pt" for folder in agents)
+    evaluate.main(evaluate.Config(models, json="scores.json", **FEW))
+    said = capsys.readouterr().out
+    assert said.startswith("MysteryPath-Grid-v0, levels 15 to 18, 2 times each\n")
+    (task,) = json.loads(Path("scores.json").read_text())
+    assert task["finished"] == 1
+    gru, trxl = task["agents"]
+    assert (gru["agent"], gru["runs"]) == ("ppo_gru", list(models[:2]))
+    assert (trxl["agent"], trxl["runs"]) == ("ppo_trxl", list(models[2:]))
+    assert list(gru["metrics"]) == ["success", "return", "length", "num_fails"]
+    falls = np.array(trxl["metrics"]["num_fails"]["scores"])
+    assert falls.shape == (2, 4)
+    low, high = trxl["metrics"]["num_fails"]["interval"]
+    assert low <= trxl["metrics"]["num_fails"]["iqm"] <= high
+    assert f"| num_fails | ppo_trxl | 2 | {falls.mean():.3f} |" in said
+
+    args, _ = ppo_trxl.load_model(models[2])
+    args.eval_levels, args.eval_repeats = 4, 2
+    envs = ppo_trxl.make_envs(args, 8)
+    agent = ppo_trxl.make_agent(envs, {}, args, torch.device("cpu"))
+    ppo_trxl.load_weights(agent, models[2])
+    torch.manual_seed(1)
+    found = ppo_trxl.evaluate(agent, envs, args)["num_fails"]
+    assert falls[0].tolist() == [np.mean(found[2 * level : 2 * level + 2]) for level in range(4)]
+    assert len(set(falls[0])) > 1, "levels that can be told apart"
+
+
+def test_episodes_cut_short(agents, capsys):
+    """What only an episode's end tells is unknown then, and not made up."""
+    evaluate.main(evaluate.Config((f"{agents[0]}/model.pt",), max_steps=3, json="scores.json", **FEW))
+    (task,) = json.loads(Path("scores.json").read_text())
+    assert task["finished"] == 0
+    assert list(task["agents"][0]["metrics"]) == ["return", "length"]
+    assert "--max-steps cut 100.00% of the episodes" in capsys.readouterr().out
+
+
+def test_metrics_that_every_episode_told():
+    told = {"return": np.zeros(2), "length": np.ones(2), "finished": np.ones(2), "success": np.zeros(2)}
+    assert evaluate.choose_metrics((), "MysteryPath-v0", [told, told]) == ["success", "return", "length"]
+    assert evaluate.choose_metrics(("finished",), "MysteryPath-v0", [told]) == ["finished"]
+    cut = told | {"success": np.array([0, np.nan])}
+    assert evaluate.choose_metrics((), "MysteryPath-v0", [told, cut]) == ["return", "length"]
+    with pytest.raises(ValueError, match="not every episode told success; they told return, length, finished"):
+        evaluate.choose_metrics(("success",), "MysteryPath-v0", [told, cut])
+
+
+# ---- bad input ----
+BAD = {
+    "": "give either checkpoints to play with .* or --curves",
+    "a.pt --curves runs": "give either checkpoints",
+    "nowhere.pt": "there is no file nowhere.pt",
+    "notes.txt": "notes.txt is not a model that --save-model wrote",
+    "MODEL --levels 0": "--levels is 0; it must be 1 or more",
+    "MODEL --max-steps 0": "--max-steps is 0",
+    "MODEL --json no/where.json": "there is no folder no to write to",
+    "MODEL --metrics coins": "not every episode told coins; they told return, length, finished",
+    "--curves nowhere": "there is no run folder nowhere",
+    "--curves empty": "empty holds no curves",
+    "--curves RUN --metrics coins": "no curve of coins in common; they all have .*eval/success",
+    "--curves RUN --out no/where": "there is no folder no to write to",
+}
+
+
+def test_bad_input(agents, tmp_path):
+    (tmp_path / "notes.txt").write_text("some notes")
+    (tmp_path / "empty").mkdir()
+    for line, fault in BAD.items():
+        words = line.replace("MODEL", f"{agents[0]}/model.pt --levels 1").replace("RUN", agents[0]).split()
+        with pytest.raises((ValueError, OSError), match=fault):
+            evaluate.main(evaluate.tyro.cli(evaluate.Config, args=words))
+
+
+def test_the_command_prints_one_line_and_fails(tmp_path):
+    done = subprocess.run(
+        [sys.executable, evaluate.__file__, "nowhere.pt"], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 1
+    assert done.stderr == "evaluate.py: there is no file nowhere.pt; --save-model writes model.pt to the run folder\n"
