@@ -31,6 +31,7 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -62,7 +63,9 @@ class Args:
     cuda: bool = True
     """train on the GPU when there is one"""
     amp: bool = False
-    """compute the networks in bfloat16, twice as fast on processors that have it; losses stay in float32"""
+    """compute the networks in bfloat16, faster on processors that have it; losses stay in float32"""
+    compile: bool = False
+    """compile convolutions and heads when training begins: takes a minute, and on a CPU a C++ compiler"""
     track: bool = False
     """log to Weights and Biases too (needs the extra `track`)"""
     wandb_project_name: str = "memory-gym-baselines"
@@ -478,10 +481,16 @@ class AtariCNN(nn.Sequential):
     def forward(self, pixels: Tensor) -> Tensor:
         """Encode uint8 pixels, scaled to [0, 1], or float ones as they are."""
         # A CPU's caches want small batches: the backward pass of 2,048 frames at once takes about 1.5 times as long.
-        chunks = pixels.split(self.chunk) if pixels.device.type == "cpu" else [pixels]
-        features = [super(AtariCNN, self).forward(self.scale(chunk)) for chunk in chunks]
+        size = self.chunk if pixels.device.type == "cpu" else 8 * self.chunk
+        # What is compiled is so for one size: the rest of a batch would be compiled anew every time.
+        whole, rest = self.convolve, partial(AtariCNN.convolve, self)
+        features = [(whole if len(chunk) == size else rest)(chunk) for chunk in pixels.split(size)]
         features = torch.cat(features) if len(features) > 1 else features[0]  # (B, channels, height, width)
         return features.permute(0, 2, 3, 1).flatten(1)  # in the order they have in memory: no copy
+
+    def convolve(self, pixels: Tensor) -> Tensor:
+        """Scale and convolve pixels: (B, height, width, channels) to (B, channels, height, width)."""
+        return super().forward(self.scale(pixels))
 
     @staticmethod
     def scale(pixels: Tensor) -> Tensor:
@@ -906,6 +915,22 @@ class MemoryLimit(ValueError):
     """A memory cannot hold what it is given; says which flag helps. Raised by `Memory.step`."""
 
 
+def compile_layers(agent: Agent) -> None:
+    """Compile the convolutions, for pieces of their full size, and the heads, for any batch.
+
+    Raises ValueError if that fails.
+    """
+    for cnn in agent.encoder.cnns:
+        cnn.convolve = torch.compile(cnn.convolve, dynamic=False)
+    for layers in (agent.heads.trunk, agent.heads.policy, agent.heads.value):
+        layers.compile(dynamic=True)
+    device = next(agent.parameters()).device
+    try:
+        agent.heads(torch.zeros(2, agent.memory.width, device=device))
+    except Exception as error:  # whatever the compiler raises
+        raise ValueError(f"--compile: {error}; install a C++ compiler (g++), or leave --compile out") from None
+
+
 def make_agent(envs: gym.vector.VectorEnv, infos: dict, args: Args, device: torch.device) -> Agent:
     """Make the agent for the environments, whose infos have the ground truth if that is to be estimated.
 
@@ -1278,6 +1303,8 @@ def setup(args: Args) -> Run:
     agent = make_agent(envs, infos, args, device)
     if args.load_model is not None:
         load_weights(agent, args.load_model)
+    if args.compile:
+        compile_layers(agent)
     optimizer = torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)
     ground_truth = ground_truth_of(infos) if agent.estimator is not None else None
     try:

@@ -162,3 +162,14 @@ def test_an_episode_that_outlasts_a_learned_encoding(tmp_path):
     assert last.startswith("ppo_trxl.py: --trxl-pe-length is 40, but an episode is longer; make it"), done.stderr
     assert "Traceback" not in done.stderr
     assert len(list(tmp_path.glob("runs/*/model.pt"))) == 1
+
+
+def test_a_compiler_that_is_missing(tiny, monkeypatch):
+    def fail(*_, **__):
+        raise RuntimeError("no working C++ compiler")
+
+    monkeypatch.setattr(ppo_gru.Heads, "forward", fail)
+    message = setup_error(tiny(env_id="CueRecall-v0", compile=True))
+    assert message.startswith(
+        "--compile: no working C++ compiler; install a C++ compiler (g++), or leave --compile out"
+    )

@@ -31,3 +31,10 @@ def test_recurrent_memory(tiny, scalars, memory, low, high):
 def test_transformer_memory(tiny, scalars, encoding, gate):
     args = tiny(ppo_trxl, trxl_positional_encoding=encoding, trxl_gate=gate, **WINDOW, **SETTINGS)
     assert final_return(scalars, ppo_trxl, args) >= 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("faster", ["amp", "compile"])
+def test_with_bfloat16_or_compiled(tiny, scalars, faster):
+    for script, memory in ((ppo_gru, {"hidden_size": 64}), (ppo_trxl, WINDOW)):
+        assert final_return(scalars, script, tiny(script, **{faster: True}, **memory, **SETTINGS)) >= 0.95

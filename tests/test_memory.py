@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from conftest import SMALL
 from gymnasium.vector import AutoresetMode
 from torch import nn
 
@@ -58,6 +59,18 @@ def test_ratio_is_nearly_one_in_bfloat16(played, memory):
         _, ratio, values = recompute(run)
     assert (ratio - 1).abs().max() < 5e-2
     assert values.dtype == run.rollout.log_probs.dtype == torch.float32
+
+
+@pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
+def test_ratio_is_nearly_one_when_compiled(played, script):
+    """The rollout's four frames are not compiled, the update's 256 are."""
+    changes = {"num_steps": 64, "num_minibatches": 1, "total_timesteps": 256, "weights_scale": 3.0}
+    _, run, *_ = played(script=script, env_id="MortarMayhem-Grid-v0", compile=True, **changes)
+    assert (recompute(run)[1] - 1).abs().max() < 1e-4
+    plain = script.make_agent(run.envs, {}, script.Args(**{**SMALL[script], "cuda": False}), torch.device("cpu"))
+    plain.load_state_dict(run.agent.state_dict())  # the same names: a checkpoint does not tell
+    x = torch.randint(0, 256, (300, 84, 84, 3), dtype=torch.uint8)
+    torch.testing.assert_close(run.agent.encoder({"observation": x}), plain.encoder({"observation": x}))
 
 
 @pytest.mark.parametrize("memory", MEMORIES[:-1])

@@ -1,0 +1,395 @@
+"""enjoy.py: what the page holds is what happened, and in a browser it goes where one clicks."""
+
+import base64
+import dataclasses
+import io
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from selenium import webdriver
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.actions.action_builder import ActionBuilder
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import Select, WebDriverWait
+
+import enjoy
+import ppo_gru
+import ppo_trxl
+
+AGENTS = {
+    "GRU": (ppo_gru, {"env_id": "MysteryPath-Grid-v0", "reconstruction_coef": 0.1, "ground_truth_coef": 0.1}),
+    "LSTM": (ppo_gru, {"env_id": "MortarMayhemB-v0", "memory": "lstm"}),
+    "no memory": (ppo_gru, {"env_id": "MysteryPath-v0", "memory": "none", "frame_stack": 4, "step_encoding": True}),
+    "TrXL": (ppo_trxl, {"env_id": "MortarMayhem-Grid-v0", "ground_truth_coef": 0.1}),
+    "GTrXL": (ppo_trxl, {"env_id": "SearingSpotlights-v0", "obs_type": "vector", "trxl_gate": "gru", "amp": True}),
+    "CartPole": (ppo_gru, {"env_id": "CartPole-v1"}),
+}
+
+
+@pytest.fixture
+def saved(tiny):
+    """Save an agent with random weights as model.pt, and return its arguments."""
+
+    def save(script=ppo_gru, **changes):
+        args = tiny(script, **{"env_id": "MysteryPath-Grid-v0", **changes})
+        torch.manual_seed(1)
+        envs = script.make_envs(args, 1)
+        _, infos = envs.reset(seed=1)
+        agent = script.make_agent(envs, infos, args, torch.device("cpu"))
+        with torch.no_grad():  # the initial policy hardly depends on its input
+            for parameter in agent.heads.parameters():
+                parameter.mul_(3)
+        script.save_model(agent, args, "model.pt")
+        return args
+
+    return save
+
+
+def played(seed=3, max_steps=60):
+    agent, envs, args = enjoy.load("model.pt")
+    options = ppo_gru.reset_options(args.env_id, args.env_options)
+    return enjoy.play(agent, envs, seed, options, max_steps)
+
+
+def data_of(page):
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)[1])
+
+
+def picture(url):
+    """The pixels (h, w, 3) of a data URL."""
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB"))
+
+
+def frames_of(video):
+    """The frames (T, h, w, 3) of a video on the page."""
+    shape = (-1, video["height"], video["width"], 3)
+    return np.concatenate([picture(sheet).reshape(shape) for sheet in video["sheets"]])
+
+
+# ---- what is recorded ----
+@pytest.mark.parametrize("name", AGENTS)
+def test_every_kind_of_agent(name, saved):
+    script, changes = AGENTS[name]
+    args = saved(script, **changes)
+    line = enjoy.main(enjoy.Config("model.pt", seed=3, max_steps=60))
+    with open("page.html") as file:
+        page = data_of(file.read())
+    steps = page["steps"]
+    assert line.startswith(f"page.html: {steps} steps, return {page['facts']['return']}, ")
+    assert page["facts"]["agent"] == ("GRU" if name == "CartPole" else name)
+    assert all(len(each) == steps for each in (page["actions"], *page["lines"].values()))
+    names = ["rendered frame" if name in ("GTrXL", "CartPole") else "agent's view"]
+    names += ["ground truth"] * (name != "CartPole") + ["reconstruction"] * bool(args.reconstruction_coef)
+    assert [video["name"] for video in page["videos"]] == names
+    assert all(len(frames_of(video)) == steps for video in page["videos"])
+    assert len(page["truth"]) == steps * (name != "CartPole")
+    assert len(page["estimate"]) == steps * bool(args.ground_truth_coef)
+    assert (page["attention"] is not None) == (script is ppo_trxl)
+    for branch in page["branches"]:
+        assert np.allclose(np.sum(branch["probabilities"], 1), 1, atol=1e-4)
+        assert len(branch["actions"]) == len(branch["probabilities"][0])
+
+
+def test_the_episode_is_the_agents(saved):
+    """Played again with the agent's own `act`: the same pictures, numbers and attention, step for step."""
+    saved(ppo_trxl, env_id="MortarMayhem-Grid-v0")
+    agent, envs, _ = enjoy.load("model.pt")
+    episode = enjoy.play(agent, envs, 3, None, 60)
+    page = enjoy.page_data(episode, "MortarMayhem-Grid-v0", {})
+    view, truth = map(frames_of, page["videos"])
+    torch.manual_seed(3)
+    obs, infos = envs.reset(seed=3)
+    live = agent.memory.initial(1, torch.device("cpu"), 60)
+    for t, actions in enumerate(episode.actions):
+        assert np.array_equal(view[t], obs[0])
+        envs.render_mode = "debug_rgb_array"
+        assert np.array_equal(truth[t], envs.render()[0])
+        assert np.array_equal(episode.truth[t], infos["ground_truth"][0])
+        with torch.no_grad():
+            looks = agent.memory.attention(agent.encoder(ppo_gru.as_tensors(obs)), live)[0]
+            policy, value, live, _ = agent.act(ppo_gru.as_tensors(obs), live)
+        assert episode.values[t] == value.item()
+        assert np.array_equal(episode.policy[t][0], policy[0].probs[0].numpy())
+        assert np.array_equal(episode.attention[t], looks.numpy())
+        assert actions == [policy[0].sample().item()]
+        obs, rewards, terminated, truncated, infos = envs.step(np.array(actions))
+        assert episode.rewards[t] == rewards[0]
+        assert (terminated | truncated)[0] == (episode.finished and t == len(episode.actions) - 1)
+    assert episode.finished
+    assert episode.final["length"] == len(episode.actions)
+
+
+def test_seed_is_the_level_and_the_actions(saved):
+    saved()
+    first, again, other = (played(seed).actions for seed in (3, 3, 4))
+    assert first == again != other
+
+
+def test_default_level_was_not_trained_on(saved):
+    saved(num_levels=7, start_level=5)
+    enjoy.main(enjoy.Config("model.pt", max_steps=2))
+    with open("page.html") as file:
+        facts = data_of(file.read())["facts"]
+    assert facts == {"agent": "GRU", "seed": 12, "steps": 2, "return": "0", "cut short": "after 2 steps"}
+
+
+# ---- how it is packed ----
+def test_attention_is_packed_by_age():
+    looks = [np.zeros((1, 2, 1)), np.array([[[1.0], [1.0]]]), np.array([[[0.25, 0.75], [0.75, 0.25]]])]
+    looks.append(np.array([[[0.0, 1.0], [0.5, 0.5]]]))  # a window of two
+    packed = enjoy.packed(looks)
+    scores = np.frombuffer(base64.b64decode(packed["scores"]), "<u2").reshape(4, 1, 2)[:, 0] / 65535 * packed["heads"]
+    assert np.allclose(scores, [[0, 0], [0, 2], [1, 1], [0.5, 1.5]], atol=1e-4)
+    assert enjoy.packed([]) is None
+
+
+def test_displayable():
+    stack = np.arange(5, dtype=np.uint8) * np.ones((2, 3, 1), np.uint8)
+    shown = enjoy.displayable(stack)
+    assert shown.shape == (6, 9)  # three by three, the last four of them black
+    assert shown[::2, ::3].tolist() == [[0, 1, 2], [3, 4, 0], [0, 0, 0]]
+    assert enjoy.displayable(np.array([[[0.0, 0.5, 1.0]]])).tolist() == [[[0, 128, 255]]]
+
+
+def test_text_in_the_data_cannot_end_the_script():
+    episode = enjoy.Episode(policy=[[np.ones(1)]], actions=[[0]], values=[0.0], entropies=[0.0], rewards=[0.0])
+    page = enjoy.page(enjoy.page_data(episode, "CartPole-v1", {"</script>": "<!--"}), "")
+    assert page.count("</script>") == 3
+    assert data_of(page)["facts"] == {"</script>": "<!--"}
+
+
+def test_a_thousand_steps_stay_small(saved):
+    options = '{"agent_health": 1000000, "steps_per_coin": 1000000}'
+    window = {"trxl_memory_length": 256, "trxl_num_layers": 3, "reconstruction_coef": 0.1}
+    saved(ppo_trxl, env_id="Endless-SearingSpotlights-v0", env_options=options, **window)
+    assert enjoy.main(enjoy.Config("model.pt", seed=3, max_steps=100)).startswith("page.html: 100 steps")
+    library, longest_look = len(enjoy.get_plotlyjs()), 3 * 256 * 2 * 4 / 3  # three blocks, two bytes, in base64
+    assert library + 10 * (os.path.getsize("page.html") - library) + 1000 * longest_look < 15e6
+
+
+# ---- in a browser ----
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """A headless Chromium that logs its console."""
+    program, driver = shutil.which("chromium") or shutil.which("google-chrome"), shutil.which("chromedriver")
+    if not program or not driver:
+        pytest.skip("no browser: apt-get install chromium chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = program
+    flags = "headless no-sandbox disable-gpu disable-quic no-first-run disable-background-networking"
+    flags += " disable-component-update disable-sync disable-dev-shm-usage window-size=1400,1000"
+    for flag in (*flags.split(), f"user-data-dir={tmp_path_factory.mktemp('browser')}"):
+        options.add_argument(f"--{flag}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    browser = webdriver.Chrome(options, webdriver.ChromeService(driver))
+    yield browser
+    browser.quit()
+
+
+@pytest.fixture
+def watch(browser, saved, tmp_path_factory):
+    """Open the page of a transformer's episode at a step; return what it holds, and its videos' frames.
+
+    In the end there is nothing in the browser's console, and the page has loaded nothing.
+    """
+    path = tmp_path_factory.getbasetemp() / "watched.html"  # one page for all tests
+
+    def open_page(step):
+        if not path.exists():
+            saved(ppo_trxl, env_id="MortarMayhem-Grid-v0", trxl_memory_length=128)
+            enjoy.main(enjoy.Config("model.pt", seed=3, out=str(path)))
+        browser.get("about:blank")  # or the same page at another step would not be loaded anew
+        browser.get(f"{path.as_uri()}#{step}")
+        page = data_of(path.read_text())
+        return page, [frames_of(video) for video in page["videos"]]
+
+    yield open_page
+    assert browser.get_log("browser") == []
+    assert browser.execute_script("return performance.getEntriesByType('resource').length") == 0
+
+
+def step_of(browser):
+    return int(browser.find_element("tag name", "output").text.split()[1].strip(","))
+
+
+def check_step(browser, videos, step):
+    """The page says that it is at the step, and every video shows the frame of it, to the pixel."""
+    assert step_of(browser) == step
+    check_shown(browser, videos, step)
+
+
+def check_shown(browser, videos, step):
+    def is_shown(_):
+        urls = browser.execute_script("return [...document.querySelectorAll('canvas')].map(each => each.toDataURL())")
+        return all(np.array_equal(picture(url), video[step]) for url, video in zip(urls, videos, strict=True))
+
+    WebDriverWait(browser, 10).until(is_shown)
+
+
+def place(browser, selector, index):
+    """Where the index-th selected part of the page is in the window: left, top, width, height."""
+    script = "const box = document.querySelectorAll(arguments[0])[arguments[1]].getBoundingClientRect();"
+    return browser.execute_script(script + "return [box.x, box.y, box.width, box.height]", selector, index)
+
+
+def point(browser, x, y):
+    actions = ActionBuilder(browser)
+    actions.pointer_action.move_to_location(round(x), round(y))
+    actions.perform()
+
+
+def click(browser, x, y):
+    point(browser, x, y)
+    ActionChains(browser).click().perform()
+
+
+def press(browser, *keys):
+    ActionChains(browser).send_keys(*keys).perform()
+
+
+def test_click_on_a_line(browser, watch):
+    page, videos = watch(5)
+    check_step(browser, videos, 5)
+    for line, step in enumerate((31, 12, 40)):
+        x, y, width, height = place(browser, "#curves .scatterlayer .js-line", line)
+        click(browser, x + width * step / (page["steps"] - 1), y + height / 2)
+        check_step(browser, videos, step)
+
+
+def test_click_on_an_attention_score(browser, watch):
+    page, videos = watch(40)
+    look = page["attention"]
+    scores = np.frombuffer(base64.b64decode(look["scores"]), "<u2").reshape(page["steps"], 2, -1)
+    for block, i in ((0, 0), (1, 9)):
+        best = np.argsort(-scores[40, block].astype(int))[:16] + 40 - look["items"]
+        x, y, width, height = place(browser, "#curves .scatterlayer .points .point", 16 * block + i)
+        point(browser, x + width / 2, y + height / 2)
+        check_shown(browser, videos, best[i])
+        point(browser, 0, 0)
+        check_step(browser, videos, 40)
+        click(browser, x + width / 2, y + height / 2)
+        check_step(browser, videos, best[i])
+        press(browser, Keys.HOME)
+        ActionChains(browser).key_down(Keys.SHIFT).send_keys(*[Keys.ARROW_RIGHT] * 4).key_up(Keys.SHIFT).perform()
+        check_step(browser, videos, 40)
+
+
+def test_keys(browser, watch):
+    page, videos = watch(0)
+    press(browser, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_LEFT)
+    check_step(browser, videos, 2)
+    press(browser, Keys.HOME, Keys.ARROW_LEFT)
+    check_step(browser, videos, 0)
+    press(browser, Keys.END, Keys.ARROW_RIGHT)
+    check_step(browser, videos, page["steps"] - 1)
+    press(browser, Keys.SPACE)  # plays, from the beginning as it is at the end
+    button = browser.find_element("id", "play")
+    assert button.text == "Pause"
+    WebDriverWait(browser, 10).until(lambda _: 3 <= step_of(browser) < page["steps"] - 1)
+    press(browser, Keys.SPACE)
+    assert button.text == "Play"
+    check_step(browser, videos, step_of(browser))
+    button.click()
+    assert browser.switch_to.active_element.tag_name == "body"
+    press(browser, Keys.SPACE)  # pauses, and does not press the button again
+    assert button.text == "Play"
+    Select(browser.find_element("tag name", "select")).select_by_value("25")
+    press(browser, Keys.HOME, Keys.ARROW_RIGHT)  # of the video, not of the list
+    check_step(browser, videos, 1)
+    press(browser, Keys.SPACE)
+    WebDriverWait(browser, 10).until(lambda _: button.text == "Play")  # stops at the end
+    check_step(browser, videos, page["steps"] - 1)
+
+
+def test_bars_and_numbers_are_those_of_the_step(browser, watch):
+    page, _ = watch(7)
+    texts = [each.text for each in browser.find_elements("css selector", "#bars .bartext")]
+    assert texts == [f"{each:.2f}" for each in page["branches"][0]["probabilities"][7]]
+    colors = browser.execute_script(
+        "return [...document.querySelectorAll('#bars .point path')].map(bar => bar.style.fill)"
+    )
+    red, blue = "rgb(200, 85, 61)", "rgb(185, 203, 220)"
+    assert colors == [red if action == page["actions"][7][0] else blue for action in range(4)]
+    row = browser.find_element("css selector", "#truth tr").text
+    assert row == " ".join(["true", *(f"{each:.3f}" for each in page["truth"][7])])
+
+
+def test_narrow_window(browser, watch):
+    watch(3)
+    browser.set_window_size(500, 900)
+    try:
+        fits = "return document.documentElement.scrollWidth <= innerWidth"
+        WebDriverWait(browser, 10).until(lambda _: browser.execute_script(fits))
+    finally:
+        browser.set_window_size(1400, 1000)
+
+
+# ---- bad input ----
+def test_bad_input_is_one_line(saved):
+    saved()
+    program = os.path.abspath(enjoy.__file__)
+    made = subprocess.run([sys.executable, program, "missing.pt"], capture_output=True, text=True)
+    assert (made.returncode, made.stdout) == (1, "")
+    assert made.stderr == "enjoy.py: there is no file missing.pt; --save-model writes model.pt to the run folder\n"
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"checkpoint": enjoy.__file__}, "enjoy.py is not a model that --save-model wrote"),
+        ({"seed": -1}, "--seed is -1; it must be 0 or more"),
+        ({"max_steps": 0}, "--max-steps is 0; it must be from 1 to 100000"),
+        ({"out": "nowhere/page.html"}, "there is no folder nowhere"),
+        ({"out": "."}, "directory"),
+    ],
+)
+def test_bad_input(config, message, saved):
+    saved()
+    with pytest.raises((ValueError, OSError), match=re.escape(message)):
+        enjoy.main(enjoy.Config(**{"checkpoint": "model.pt", **config}))
+    assert not os.path.exists("page.html")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"env_id": "CueRecall-v0"}, "CueRecall-v0 cannot be made: .*render_mode"),
+        ({"env_options": '{"agent_scal": 1}'}, "agent_scal.*agent_scale"),
+        ({"obs_type": "vector"}, "holds the weights of another network"),
+    ],
+)
+def test_checkpoint_that_cannot_play(change, message, saved):
+    args = saved()
+    model = torch.load("model.pt", weights_only=True)
+    torch.save({**model, "args": dataclasses.asdict(dataclasses.replace(args, **change))}, "model.pt")
+    with pytest.raises(ValueError, match=message):
+        enjoy.main(enjoy.Config("model.pt"))
+
+
+def test_episode_longer_than_the_memory_can_number(saved):
+    saved(ppo_trxl, trxl_positional_encoding="learned", trxl_pe_length=5)
+    with pytest.raises(ValueError, match="--trxl-pe-length is 5, but an episode is longer"):
+        enjoy.main(enjoy.Config("model.pt"))
+
+
+def test_diverged_weights(saved):
+    saved()
+    model = torch.load("model.pt", weights_only=True)
+    model["weights"]["heads.value.2.bias"].fill_(torch.nan)
+    torch.save(model, "model.pt")
+    with pytest.raises(ValueError, match="holds weights that are no finite numbers: the training diverged"):
+        enjoy.main(enjoy.Config("model.pt"))
+
+
+def test_missing_extra(monkeypatch):
+    monkeypatch.setattr(enjoy, "get_plotlyjs", None)
+    with pytest.raises(ImportError, match=re.escape('enjoy.py needs plotly and pillow: pip install -e ".[eval]"')):
+        enjoy.main(enjoy.Config("model.pt"))
