@@ -3,8 +3,9 @@
     python benchmarks/env_fps.py [--seconds S] [--num-envs N] [--many-envs M] [--ids ID ...]
 
 Prints two Markdown tables, of frames and of vector observations, both beside memory-gym's one environment. Actions are
-random, resets included. memory-gym is optional: without it, its columns are empty. The measurements of the two packages
-take turns, and each column shows the best of its rounds, because machines are noisy. Ratios are what to quote.
+random, resets included. memory-gym is optional: without it, its columns are empty. Because machines are noisy, seconds
+are the processor's time for this process, without that of other programs, the measurements of the two packages take
+turns, and each column shows the best of its rounds. Ratios are what to quote.
 """
 
 import argparse
@@ -52,39 +53,39 @@ def single_rate(env, seconds: float) -> float:
     """Steps per second of one environment, resets included."""
     actions = [env.action_space.sample() for _ in range(ACTIONS)]
     env.reset(seed=1)
-    steps, start = 0, time.perf_counter()
-    while time.perf_counter() - start < seconds:
+    steps, start = 0, time.process_time()
+    while time.process_time() - start < seconds:
         for action in actions:
             _, _, terminated, truncated, _ = env.step(action)
             if terminated or truncated:
                 env.reset()
         steps += ACTIONS
-    return steps / (time.perf_counter() - start)
+    return steps / (time.process_time() - start)
 
 
 def vector_rate(envs, seconds: float) -> float:
     """Steps per second of all lanes together, automatic resets included."""
     actions = [envs.action_space.sample() for _ in range(ACTIONS)]
     envs.reset(seed=1)
-    rounds, start = 0, time.perf_counter()
-    while time.perf_counter() - start < seconds:
+    rounds, start = 0, time.process_time()
+    while time.process_time() - start < seconds:
         for action in actions[rounds % ACTIONS :][:16]:
             envs.step(action)
         rounds += 16
-    return rounds * envs.num_envs / (time.perf_counter() - start)
+    return rounds * envs.num_envs / (time.process_time() - start)
 
 
 def reset_rate(env, seconds: float) -> float:
     """Resets per second of one environment."""
-    resets, start = 0, time.perf_counter()
-    while time.perf_counter() - start < seconds:
+    resets, start = 0, time.process_time()
+    while time.process_time() - start < seconds:
         env.reset()
         resets += 1
-    return resets / (time.perf_counter() - start)
+    return resets / (time.process_time() - start)
 
 
 def measure(
-    id_: str, original: type | None, lanes: tuple[int, int], seconds: float, rounds: int = 4
+    id_: str, original: type | None, lanes: tuple[int, int], seconds: float, rounds: int = 8
 ) -> dict[str, float]:
     """The best rate of every measurement over the rounds, in which the packages take turns.
 

@@ -113,8 +113,8 @@ class MemoryGymVectorEnv(VectorEnv):
         """Looks up the tables that follow from the options, and where each lane's rows start in them."""
         raise NotImplementedError
 
-    def begin(self, lane: int, rng: np.random.Generator) -> None:
-        """Builds the lane's next level from the generator and starts its episode."""
+    def begin(self, lanes: np.ndarray) -> None:
+        """Builds the lanes' next levels, each from its generator in `self.np_random`, and starts their episodes."""
         raise NotImplementedError
 
     def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -174,8 +174,7 @@ class MemoryGymVectorEnv(VectorEnv):
         (ended,) = (terminated | truncated).nonzero()
         if ended.size:
             infos = self._final_info(ended, observations)
-            for lane in ended.tolist():
-                self._next_level(lane, None)
+            self._next_levels(ended, [None] * self.num_envs)
             overwrite(observations, ended, self.observe(ended))
         infos.update(self._truth_info(None))
         return observations, rewards, terminated, truncated, infos
@@ -234,12 +233,17 @@ class MemoryGymVectorEnv(VectorEnv):
             for lane in lanes.tolist():
                 self.settings[lane] = settings
             self.configure(lanes)
-        for lane in lanes.tolist():
-            self._next_level(lane, seeds[lane])
+        self._next_levels(lanes, seeds)
         self.ready = True
 
-    def _next_level(self, lane: int, seed: int | None) -> None:
-        """Seeds the lane's generator if there is a seed or a choice of levels, and starts its next episode."""
+    def _next_levels(self, lanes: np.ndarray, seeds: list[int | None]) -> None:
+        """Starts the lanes' next episodes. seeds: one for every lane of N."""
+        for lane in lanes.tolist():
+            self._seed(lane, seeds[lane])
+        self.begin(lanes)
+
+    def _seed(self, lane: int, seed: int | None) -> None:
+        """Seeds the lane's generator if there is a seed or a choice of levels."""
         if seed is not None and self.num_levels:
             stream = np.random.SeedSequence(seed, spawn_key=(LEVEL_STREAM,))
             self._level_rngs[lane] = np.random.Generator(np.random.PCG64(stream))
@@ -249,7 +253,6 @@ class MemoryGymVectorEnv(VectorEnv):
             seed = self.start_level + int(self._level_rngs[lane].integers(self.num_levels))
         if seed is not None or self._rngs[lane] is None:
             self._rngs[lane], self._seeds[lane] = seeding.np_random(seed)
-        self.begin(lane, self._rngs[lane])
 
     def checked_actions(self, actions: Any) -> np.ndarray:
         """The actions as int64, or a ValueError that says what they must be."""

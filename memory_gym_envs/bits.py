@@ -135,9 +135,10 @@ def pixels(masks: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
 
 
 def tile_counts(lines: np.ndarray) -> np.ndarray:
-    """Bits of samples, (n, 42) uint64, in each tile of 12 x 12 pixels, at most 48: (n, 7, 7) uint8."""
+    """Bits of samples, (n, 42) uint64, in each tile of 12 x 12 pixels, at most 48: (n, 49) uint8."""
     counts = np.bitwise_count(lines.view(np.uint8)).view(np.uint64).reshape(len(lines), TILES, -1)
-    return np.einsum("njr->nj", counts).view(np.uint8).reshape(len(lines), TILES, 8)[..., :TILES]
+    sums_ = np.einsum("njr->nj", counts).view(np.uint8).reshape(len(lines), TILES, 8)
+    return sums_[..., :TILES].reshape(len(lines), -1)
 
 
 _X, _Y = (ITEM * np.arange(ITEMS)[:, None] + SAMPLED).reshape(-1), STEP * np.arange(LINES)

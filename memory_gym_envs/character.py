@@ -12,8 +12,8 @@ import numpy as np
 
 from memory_gym_envs.drawing import SCREEN, Sheet, disk, make_sheet, ring
 
-PAD = 16
-SPAN = 128  # stored positions are 0 .. SPAN-1
+PAD = 25  # the radius of the largest agent, of which nothing shows at position 0
+SPAN = 137  # stored positions are 0 .. SPAN-1
 FACINGS = 8
 BODY, HAND, HAND_OUTLINE = (250, 204, 153), (250, 250, 250), (50, 50, 50)
 

@@ -29,7 +29,7 @@ from memory_gym_envs.drawing import ROW, SCREEN, Sheet, paste, ring, turned_45
 from memory_gym_envs.entries import Entries, vector_slices
 from memory_gym_envs.looks import LARGEST, Looks, View, agent_entries, covered, look, make_looks
 from memory_gym_envs.options import Option
-from memory_gym_envs.words import below, words
+from memory_gym_envs.words import below, pick, words
 
 TILE = 14  # pixels
 SIZES = range(2, 7)  # tiles along one side of the arena
@@ -190,11 +190,11 @@ def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Varian
         kinds = values["allowed_commands"]
         commands = [below(word, kinds) for _ in range(values["initial_command_count"])]
     else:
-        commands = draw_walk(word, tile, _pick(word, values["command_count"]), size, values["allowed_commands"])
-    show = _pick(word, values["command_show_duration"]) if variant.clue else 0
-    gap = _pick(word, values["command_show_delay"]) if variant.clue else 0
-    burn = _pick(word, values["explosion_duration"])
-    return Level(tile, offset, commands, show, gap, burn, _pick(word, values["explosion_delay"]))
+        commands = draw_walk(word, tile, pick(word, values["command_count"]), size, values["allowed_commands"])
+    show = pick(word, values["command_show_duration"]) if variant.clue else 0
+    gap = pick(word, values["command_show_delay"]) if variant.clue else 0
+    burn = pick(word, values["explosion_duration"])
+    return Level(tile, offset, commands, show, gap, burn, pick(word, values["explosion_delay"]))
 
 
 def draw_walk(word: Callable[[], int], tile: int, count: int, size: int, kinds: int) -> list[int]:
@@ -221,11 +221,6 @@ def _valid_commands(size: int, kinds: int) -> list[list[tuple[int, int]]]:
         for x in range(size)
         for y in range(size)
     ]
-
-
-def _pick(word: Callable[[], int], values: tuple[int, ...]) -> int:
-    """What Generator.choice would pick. It draws nothing from a single value."""
-    return values[0] if len(values) == 1 else values[below(word, len(values))]
 
 
 def write_level(s: State, lane: int, level: Level, variant: Variant) -> None:
@@ -555,9 +550,11 @@ class MortarMayhem(MemoryGymVectorEnv):
             # An agent that is no wider than a tile cannot hide one.
             self._large = any(2 * figure.reach > TILE for figure in self.figures)
 
-    def begin(self, lane: int, rng: np.random.Generator) -> None:
-        """Draws the lane's next level and starts its episode."""
-        write_level(self.state, lane, draw_level(rng, self.settings[lane], self.variant), self.variant)
+    def begin(self, lanes: np.ndarray) -> None:
+        """Draws the lanes' next levels and starts their episodes."""
+        for lane in lanes.tolist():
+            level = draw_level(self._rngs[lane], self.settings[lane], self.variant)
+            write_level(self.state, lane, level, self.variant)
         self._clues_open = self.variant.clue
 
     def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

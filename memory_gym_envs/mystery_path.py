@@ -29,7 +29,7 @@ from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, magnify, make_she
 from memory_gym_envs.entries import Entries, vector_slices
 from memory_gym_envs.looks import LARGEST, Looks, View, agent_entries, covered, look, make_looks
 from memory_gym_envs.options import Option
-from memory_gym_envs.words import Tape, below
+from memory_gym_envs.words import Tape, below, pick
 
 TILE = 12  # pixels
 SIDE = 7  # tiles along one side of the screen, and of a segment of the endless path
@@ -168,7 +168,8 @@ class State:
     visited: np.ndarray  # (N,) tiles reached so far
     length: np.ndarray  # (N,) steps so far
     returned: np.ndarray  # (N,) float64: sum of rewards so far
-    # Options that the rules or the drawing need at every step.
+    # Options that the rules or the drawing need.
+    radius: np.ndarray  # (N,) of the agent's body
     speed: np.ndarray  # (N, 1) whole pixels a step, in the endless id
     show_origin: np.ndarray  # (N,) bool
     show_goal: np.ndarray  # (N,) bool
@@ -286,8 +287,7 @@ def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Varian
     if variant.endless:
         level = draw_segments(tape, below(tape, SIDE), 0, FIRST_SEGMENTS)
     else:
-        choices = values["cardinal_origin_choice"]
-        side = choices[below(tape, len(choices))] if len(choices) > 1 else choices[0]
+        side = pick(tape, values["cardinal_origin_choice"])
         start, end = below(tape, SIDE), below(tape, SIDE)
         near, far = (0, SIDE - 1) if side in (0, 2) else (SIDE - 1, 0)
         if side in (0, 1):
@@ -371,34 +371,31 @@ def cells_of(places: list[int], segment: int) -> list[int]:
     return [CELLS[place] + shift for place in places]
 
 
-def write_level(s: State, lane: int, level: Level, values: dict[str, Any], variant: Variant) -> None:
+def write_level(s: State, lane: int, level: Level, endless: bool) -> None:
     """Starts the lane's episode at this level."""
     s.step_at[lane] = PIT
     s.known[lane] = s.fallen[lane] = s.hurt[lane] = False
-    if s.past[lane]:
-        s.past[lane] = False
-        others = s.trail_lane != lane
-        s.trail_lane, s.trail_x, s.trail_y = s.trail_lane[others], s.trail_x[others], s.trail_y[others]
     s.count[lane] = s.segments[lane] = s.furthest[lane] = s.fails[lane] = s.visited[lane] = 0
     s.length[lane] = s.returned[lane] = 0
     s.walls[lane] = []
-    write_path(s, lane, level, variant)
+    write_path(s, lane, level, endless)
     s.reached[lane] = 0
     s.reached[lane, PIT] = s.reached[lane, 1] = REACHED
-    if not variant.endless:
+    if not endless:
         s.reached[lane, len(level.path)] = REACHED  # the goal has a reward of its own
-    radius = radius_of(0.25 if variant.grid else values["agent_scale"])
-    for axis, start in enumerate(divmod(level.path[0] - BEYOND, ROWS)):
-        # Not the tile's middle but for the default size, as in the original.
-        s.pos[lane, axis] = s.origin[lane, axis] = start * TILE + radius + PAD
-        s.tile[lane, axis] = (start * TILE + radius) // TILE
-    s.facing[lane] = 6 if variant.endless else 0
+    column, row = divmod(level.path[0] - BEYOND, ROWS)
+    # Not the tile's middle but for the default size, as in the original.
+    radius = int(s.radius[lane])
+    x, y = column * TILE + radius, row * TILE + radius
+    s.pos[lane] = s.origin[lane] = x + PAD, y + PAD
+    s.tile[lane] = x // TILE, y // TILE
+    s.facing[lane] = 6 if endless else 0
     s.step[lane], s.at[lane] = NO_STEP, 1  # the first step lands on the origin
     s.heading[lane] = s.heading_at[lane, 1]
     s.stamina[lane] = s.stamina_level[lane]
 
 
-def write_path(s: State, lane: int, level: Level, variant: Variant) -> None:
+def write_path(s: State, lane: int, level: Level, endless: bool) -> None:
     """Appends to the lane's path, for which there must be room."""
     first = int(s.count[lane]) + 1
     last = first + len(level.path)
@@ -407,10 +404,18 @@ def write_path(s: State, lane: int, level: Level, variant: Variant) -> None:
     s.step_at[lane][path] = np.arange(first, last)
     s.heading_at[lane, first : last - 1] = HEADINGS[path[1:] - path[:-1]]
     # Behind a transition tile the path goes on to the right. The goal has the direction that leads to it.
-    s.heading_at[lane, last - 1] = EAST if variant.endless else s.heading_at[lane, last - 2]
+    s.heading_at[lane, last - 1] = EAST if endless else s.heading_at[lane, last - 2]
     s.count[lane] = last - 1
     s.segments[lane] += len(level.walls)
     s.walls[lane] += level.walls
+
+
+def forget_trails(s: State, lanes: np.ndarray) -> None:
+    """Removes the past paths of the lanes from those that are shown."""
+    if np.count_nonzero(s.past[lanes]):
+        s.past[lanes] = False
+        left = s.past.take(s.trail_lane)
+        s.trail_lane, s.trail_x, s.trail_y = s.trail_lane[left], s.trail_x[left], s.trail_y[left]
 
 
 # ---- drawing ----
@@ -786,6 +791,7 @@ class MysteryPath(MemoryGymVectorEnv):
         s, values = self.state, self.settings[int(lanes[0])]
         s.limit[lanes] = NO_LIMIT if values["max_steps"] == -1 else values["max_steps"]
         s.feedback[lanes] = values["visual_feedback"]
+        s.radius[lanes] = radius_of(0.25 if self.variant.grid else values["agent_scale"])
         for what, option in SHOWN.items():
             getattr(s, f"show_{what}")[lanes] = values.get(option, False)
         shown = any(values.get(option, False) for what, option in SHOWN.items() if what != "past")
@@ -836,12 +842,14 @@ class MysteryPath(MemoryGymVectorEnv):
             # An agent that is no wider than a tile cannot hide one.
             self._large = any(2 * radius_of(scene.scale) > TILE for scene in self.scenes)
 
-    def begin(self, lane: int, rng: np.random.Generator) -> None:
-        """Draws the lane's next level and starts its episode."""
-        level = draw_level(rng, self.settings[lane], self.variant)
-        if make_room(self.state, len(level.path), len(level.walls)):
-            self.place_tables()
-        write_level(self.state, lane, level, self.settings[lane], self.variant)
+    def begin(self, lanes: np.ndarray) -> None:
+        """Draws the lanes' next levels and starts their episodes."""
+        forget_trails(self.state, lanes)
+        for lane in lanes.tolist():
+            level = draw_level(self._rngs[lane], self.settings[lane], self.variant)
+            if make_room(self.state, len(level.path), len(level.walls)):
+                self.place_tables()
+            write_level(self.state, lane, level, self.variant.endless)
 
     def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One step of the rules: walk, land on a tile, end or fall."""
@@ -908,7 +916,7 @@ class MysteryPath(MemoryGymVectorEnv):
             tape.close()
             if make_room(s, steps + len(level.path), segments + 1):
                 self.place_tables()
-            write_path(s, lane, level, self.variant)
+            write_path(s, lane, level, endless=True)
 
     def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32."""

@@ -4,6 +4,7 @@ Shape letters: N lanes, n some of them, S spotlights that fit, B bodies: the age
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any, NamedTuple
@@ -20,7 +21,6 @@ from memory_gym_envs.bits import (
     PLACE_0,
     PLACES,
     STEP,
-    TILES,
     Stencils,
     pixel_scratch,
     pixels,
@@ -47,6 +47,7 @@ from memory_gym_envs.character import (
 from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, disk, magnify, make_sheet, paste, ring
 from memory_gym_envs.entries import Entries, vector_slices
 from memory_gym_envs.options import Option
+from memory_gym_envs.words import below, pick, words
 
 TILE = 12  # pixels; the floor is a chessboard
 BAR = 4  # rows of the top bar
@@ -288,40 +289,34 @@ class Level(NamedTuple):
 
 def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
     """Draws a level in the original's order, so that its seeds mean the same here."""
-    facing = int(rng.integers(ZERO, EIGHT))
+    word = words(rng)
+    facing = below(word, FACINGS)
     if values["sample_agent_position"]:
-        pos, free = draw_place(rng, None, AGENT_SPACE)
+        pos, free = draw_place(word, None, AGENT_SPACE)
     else:
         pos = (MIDDLE, MIDDLE)
         free = occupied(None, pos, COIN_SPACE)
     spots = [draw_spot(rng, values) for _ in range(values["initial_spawns"])]
     if variant.endless:
-        return Level(facing, pos, spots, [draw_coin(rng, None)] if values["coin_enabled"] else [], None)
+        return Level(facing, pos, spots, [draw_coin(word, None)] if values["coin_enabled"] else [], None)
     things = []
-    for _ in range(_pick(rng, values["num_coins"]) + values["use_exit"]):
-        place, free = draw_place(rng, free, COIN_SPACE)
+    coins = pick(word, values["num_coins"]) if values["num_coins"] else 0
+    for _ in range(coins + values["use_exit"]):
+        place, free = draw_place(word, free, COIN_SPACE)
         things.append(inside(place))
     return Level(facing, pos, spots, things, things.pop() if values["use_exit"] else None)
 
 
-# Arrays without dimensions: the generator takes them faster than numbers, and draws the same.
-ZERO, TWO, FOUR, EIGHT, TURN, EVERYWHERE = (np.array(number) for number in (0, 2, 4, 8, 360, SCREEN * SCREEN))
-RADII = [np.array(radius) for radius in range(SPOT_RADII[1] + 2)]
-ASIDE, ASKEW = (np.array(-45), np.array(45)), (np.array(-135), np.array(135))
-
-
-def draw_place(rng: np.random.Generator, free: np.ndarray | None, space: int) -> tuple[tuple[int, int], np.ndarray]:
+def draw_place(word: Callable[[], int], free: np.ndarray | None, space: int) -> tuple[tuple[int, int], np.ndarray]:
     """A place near a free pixel, and what is free when the pixels around that one are occupied.
 
     free: (84, 84) bool, or None: every pixel is.
     """
-    cells = None if free is None else np.flatnonzero(free)
-    if cells is None or not cells.size:  # where nothing is free, the original fails
-        cell = int(rng.integers(ZERO, EVERYWHERE))
-    else:
-        cell = int(cells[rng.integers(0, cells.size)])
+    cells = () if free is None else np.flatnonzero(free)
+    # Where nothing is free, the original fails.
+    cell = int(cells[below(word, len(cells))]) if len(cells) else below(word, SCREEN * SCREEN)
     y, x = divmod(cell, SCREEN)
-    return (x + int(rng.integers(TWO, FOUR)), y + int(rng.integers(TWO, FOUR))), occupied(free, (x, y), space)
+    return (x + 2 + below(word, 2), y + 2 + below(word, 2)), occupied(free, (x, y), space)
 
 
 def occupied(free: np.ndarray | None, pos: tuple[int, int], space: int) -> np.ndarray:
@@ -344,20 +339,21 @@ def inside(pos: tuple[int, int]) -> tuple[int, int]:
     return x, y
 
 
-def draw_coin(rng: np.random.Generator, last: tuple[int, int] | None) -> tuple[int, int]:
+def draw_coin(word: Callable[[], int], last: tuple[int, int] | None) -> tuple[int, int]:
     """The endless task's next coin, away from the last one. It may lie under the agent, as in the original."""
     free = None if last is None else occupied(None, last, AGENT_SPACE)
-    return inside(draw_place(rng, free, AGENT_SPACE)[0])
+    return inside(draw_place(word, free, AGENT_SPACE)[0])
 
 
 def draw_spot(rng: np.random.Generator, values: dict[str, Any]) -> list[float]:
     """A new spotlight, a column of State.spots: on a bent path from one side of the screen to roughly the other."""
-    least, slowest = values["spot_min_radius"], values["spot_min_speed"]
-    radius = int(rng.integers(RADII[int(least)], RADII[int(max(least, values["spot_max_radius"])) + 1]))
+    word = words(rng)
+    least, slowest = int(values["spot_min_radius"]), values["spot_min_speed"]
+    radius = least + below(word, max(int(values["spot_max_radius"]) - least, 0) + 1)
     speed = rng.uniform(slowest, max(slowest, values["spot_max_speed"]))
-    start = int(rng.integers(ZERO, TURN))
-    target = start + 180 + int(rng.integers(ASIDE[0], ASIDE[1]))
-    offset = target + int(rng.integers(ASKEW[0], ASKEW[1]))
+    start = below(word, 360)
+    target = start + 180 - 45 + below(word, 90)
+    offset = target - 135 + below(word, 270)
     far = OUTSIDE + radius
     x, y = (MIDDLE + far * part for part in UNITS[start])
     to_x, to_y = (MIDDLE + far * part for part in UNITS[target])
@@ -383,13 +379,6 @@ def _unit(degrees: int) -> tuple[float, float]:
 
 
 UNITS = [_unit(degrees) for degrees in range(720)]
-
-
-def _pick(rng: np.random.Generator, values: tuple[int, ...]) -> int:
-    """What Generator.choice would pick, 0 of no values. It draws nothing from a single value."""
-    if not values:
-        return 0
-    return values[0] if len(values) == 1 else values[int(rng.integers(0, len(values)))]
 
 
 def write_level(s: State, lane: int, level: Level, spawns: int) -> None:
@@ -712,7 +701,8 @@ FAINT = 252  # the darkest dark in which an agent, (3, 3, 2) there, still differ
 SLIGHT = 5  # and the darkest one in which some colours may stay as they are
 FIRST_RIM = 51  # from there on a rim differs from all colours that it runs over, if only by 1
 LINES_BELOW = np.where(np.arange(0, SCREEN, STEP) < BAR, 0, LINE).astype(np.uint64)  # (42,) the sample below the bar
-TILE_SHARE = 1 / tile_counts(LINES_BELOW[None]).astype(np.float32)  # (1, 7, 7)
+TILE_SHARE = 1 / tile_counts(LINES_BELOW[None]).astype(np.float32)  # (1, 49)
+FULL_SHARE = TILE_SHARE.min()  # of a tile beside the bar
 BLUE_LINES = sample((floors()[BLUE_FLOOR].reshape(SCREEN, SCREEN, 3) == BLUE).all(axis=-1))  # (42,) or red ones
 NO_BITS = np.uint64(0)
 READING = slice(0, 8)  # the entries that come from the bar
@@ -746,7 +736,6 @@ class Gauges(NamedTuple):
     width: int  # of a vector
     at: dict[str, slice]  # where its entries are
     places: slice  # where those on the bodies' places are
-    tiles: slice  # where those on tiles are
     bars: np.ndarray
     readings: np.ndarray
     shapes: (
@@ -783,7 +772,8 @@ class Scene(NamedTuple):
     rim: np.ndarray | None  # what of the light is white, if any lane has rims
     x: np.ndarray  # (K, n) where the bodies are, as keys of the gauges
     y: np.ndarray  # (K, n)
-    layer: np.ndarray | None  # (K, n, 1) UNDER the darkness, BELOW_BAR or ABOVE_BAR; None: all are under it
+    raised: np.ndarray  # (m,) which of the frames have bodies above the darkness
+    layer: np.ndarray | None  # (K, m, 1) where those are: UNDER it, BELOW_BAR or ABOVE_BAR
     cover: np.ndarray  # (K, n, 42) what each body covers
     seen: np.ndarray  # (K, n, 42) what is visible of it
     floor: np.ndarray  # what nothing covers
@@ -815,56 +805,56 @@ def survey(s: State, g: Gauges, lanes: np.ndarray | slice) -> Scene:
     veil = VEIL.take(opacity, axis=0)  # (n, 2)
     lit |= veil[:, :1]
     clear = lit | veil[:, 1:]
-    bodies, layer = slice(spots, -1 if has_exit else None), layers(s, g, lanes)
+    bodies, (raised, layer) = slice(spots, -1 if has_exit else None), layers(s, g, lanes)
     cover = shapes[bodies]
-    seen, floor = uncover(cover, clear) if layer is None else uncover_layers(cover, clear, layer)
+    seen, floor = uncover(cover, clear)
+    if raised.size:
+        seen[:, raised], floor[raised] = uncover_layers(cover[:, raised], clear[raised], layer)
     if has_exit:
         seen[EXIT] &= shapes[-1]
-    return Scene(opacity, lit, clear, rim, *key[:, bodies], layer, cover, seen, floor)
+    return Scene(opacity, lit, clear, rim, *key[:, bodies], raised, layer, cover, seen, floor)
 
 
-def layers(s: State, g: Gauges, lanes: np.ndarray | slice) -> np.ndarray | None:
-    """Scene's layer."""
+def layers(s: State, g: Gauges, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
+    """Scene's raised and layer."""
     coins = s.coin_age[lanes] < s.coin_show[lanes]
-    if not np.count_nonzero(coins) and not np.count_nonzero(s.layered[lanes]):
-        return None
+    (raised,) = (coins | s.layered[lanes]).nonzero()
+    if not raised.size:
+        return raised, None
     others = [s.agent_layer[lanes], s.exit_layer[lanes]][: g.coin]
-    return np.stack(others + [coins * BELOW_BAR] * (s.bodies.shape[2] - COIN))[..., None]
+    every = others + [coins * BELOW_BAR] * (s.bodies.shape[2] - COIN)
+    return raised, np.array([layer[raised] for layer in every])[..., None]
 
 
-def uncover(cover: np.ndarray, clear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def uncover(cover: np.ndarray, clear: np.ndarray, left: np.ndarray = LINES_BELOW) -> tuple[np.ndarray, np.ndarray]:
     """What is visible of bodies and of the floor behind them, (K, n, 42) and (n, 42).
 
-    cover: (K, n, 42) what the bodies cover, from front to back. clear: (n, 42).
+    cover: (K, n, 42) what the bodies cover, from front to back. clear: (n, 42). left: (42,) what nothing covers so far.
     """
-    hidden = np.empty((len(cover) + 1, *clear.shape), np.uint64)
-    hidden[0], hidden[1:] = ~LINES_BELOW, cover
-    left = ~np.bitwise_or.accumulate(hidden, axis=0, out=hidden)
-    seen = left[:-1] & cover
+    seen = np.empty_like(cover)
+    for body, shown in zip(cover, seen, strict=True):
+        np.bitwise_and(body, left, out=shown)
+        left = left ^ shown
     seen &= clear
-    return seen, left[-1]
+    return seen, left
 
 
 def uncover_layers(cover: np.ndarray, clear: np.ndarray, layer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same where some of the bodies are above the darkness. layer: (K, n, 1)."""
-    above, below = np.where(layer == UNDER, NO_BITS, cover), np.where(layer == UNDER, cover, NO_BITS)
-    in_front = np.zeros((2, *cover.shape), np.uint64)
-    np.bitwise_or.accumulate(above[:-1], axis=0, out=in_front[0, 1:])
-    np.bitwise_or.accumulate(below[:-1], axis=0, out=in_front[1, 1:])
-    front = np.bitwise_or.reduce(above, axis=0)
-    bar = np.where(layer == ABOVE_BAR, LINE, LINES_BELOW)
-    seen = above & ~in_front[0] & bar | below & ~(in_front[1] | front) & LINES_BELOW & clear
-    return seen, LINES_BELOW & ~(front | np.bitwise_or.reduce(below, axis=0))
+    """The same where some of the bodies are above the darkness, and before all others. layer: (K, n, 1)."""
+    above = np.where(layer == UNDER, NO_BITS, cover)
+    free = ~np.bitwise_or.reduce(above, axis=0)
+    seen_above, _ = uncover(above, np.where(layer == ABOVE_BAR, LINE, LINES_BELOW), LINE)
+    seen_below, floor = uncover(cover ^ above, clear & free)
+    return seen_above | seen_below, floor & free
 
 
 def describe_bar(s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, out: np.ndarray) -> None:
     """Writes health, action and reward."""
     senses = bar_rows(s, lanes)
     out[:, READING] = g.readings.take(senses, axis=0)
-    if scene.layer is not None:
-        over_bar = scene.layer == ABOVE_BAR  # (K, n, 1)
-        (high,) = over_bar.any(axis=(0, 2)).nonzero()
-        cover = g.high.at(scene.x[:, high], scene.y[:, high]) * over_bar[:, high]  # (K, m, words)
+    if scene.layer is not None and (scene.layer == ABOVE_BAR).any():
+        high, over_bar = scene.raised, scene.layer == ABOVE_BAR  # (m,), (K, m, 1)
+        cover = g.high.at(scene.x[:, high], scene.y[:, high]) * over_bar  # (K, m, words)
         left = ~np.bitwise_or.reduce(cover, axis=0).view(np.uint16).reshape(-1, BAR, ITEMS)
         columns = unpacked(np.bitwise_or.reduce(left, axis=1))  # (m, 84) those of which anything is left
         out[high, READING] = read_bars(g.bars[senses[high]].reshape(-1, SCREEN, 3) * columns[..., None])
@@ -890,7 +880,7 @@ def describe_rest(s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, 
     out[whole, g.at["facing"].start + s.look[lanes][whole]] = 1
     if "exit" in g.at:
         out[:, g.at["exit_open"].start] = s.is_open[lanes] * any_[EXIT]
-    describe_tiles(g, seen, bright, out)
+    describe_tiles(g, seen, any_[:bodies], bright, out)
 
 
 def describe_places(g: Gauges, seen: np.ndarray, any_: np.ndarray, out: np.ndarray) -> None:
@@ -905,26 +895,27 @@ def describe_places(g: Gauges, seen: np.ndarray, any_: np.ndarray, out: np.ndarr
         body, lane = each[:kinds, :, 0].nonzero()
         total = each[body, lane]
     total[:, 1:] /= SCREEN * total[:, :1]
-    np.minimum(total[:, 0] * TILE_SHARE.min(), 1, out=total[:, 0])
+    np.minimum(total[:, 0] * FULL_SHARE, 1, out=total[:, 0])
     out[:, g.places].reshape(n, kinds, 3)[lane, body] = total
 
 
-def describe_tiles(g: Gauges, seen: np.ndarray, bright: np.ndarray, out: np.ndarray) -> None:
-    """Writes which share of each tile shows coins (not in the endless id) and light."""
-    kinds, n = g.coin, len(bright)
-    lines = np.empty((n, kinds, LINES), np.uint64)
-    if kinds > 1:
-        np.bitwise_or.reduce(seen[g.coin :], axis=0, out=lines[:, 0])
-    lines[:, -1] = bright
-    counts = tile_counts(lines.reshape(-1, LINES)).reshape(n, kinds, TILES, TILES)
-    np.multiply(counts, TILE_SHARE, out=out[:, g.tiles].reshape(counts.shape))
+def describe_tiles(g: Gauges, seen: np.ndarray, any_: np.ndarray, bright: np.ndarray, out: np.ndarray) -> None:
+    """Writes which share of each tile shows light and coins (not in the endless id). any_: (K, n) whether any shows."""
+    if "coins" not in g.at:
+        out[:, g.at["light"]] = tile_counts(bright) * TILE_SHARE
+        return
+    (lanes,) = any_[g.coin :].any(axis=0).nonzero()
+    coins = np.bitwise_or.reduce(seen[g.coin :, lanes], axis=0)
+    share = tile_counts(np.concatenate([bright, coins])) * TILE_SHARE
+    out[:, g.at["light"]], out[lanes, g.at["coins"]] = share[: len(bright)], share[len(bright) :]
 
 
 def rims_left(scene: Scene) -> np.ndarray:
     """What is visible of the rims, (n, 42): of any in a dark that is dark enough, and over all that is under it."""
     rim = scene.rim & LINES_BELOW & -(scene.opacity >= FIRST_RIM)[:, None].astype(np.uint64)
     if scene.layer is not None:
-        rim &= ~np.bitwise_or.reduce(np.where(scene.layer == UNDER, NO_BITS, scene.cover), axis=0)
+        above = np.where(scene.layer == UNDER, NO_BITS, scene.cover[:, scene.raised])
+        rim[scene.raised] &= ~np.bitwise_or.reduce(above, axis=0)
     return rim
 
 
@@ -1121,7 +1112,6 @@ class SearingSpotlights(MemoryGymVectorEnv):
             width=at["alarm"].stop,
             at=at,
             places=slice(at["agent"].start, at["coin"].stop),
-            tiles=slice(at["coins" if "coins" in at else "light"].start, at["light"].stop),
             bars=bars(self.variant.endless),
             readings=readings(self.variant.endless),
             shapes=shapes,
@@ -1133,15 +1123,16 @@ class SearingSpotlights(MemoryGymVectorEnv):
             handed=np.array([int(10 * values["agent_scale"]) > 0 for values in self.settings]),
         )
 
-    def begin(self, lane: int, rng: np.random.Generator) -> None:
-        """Draws the lane's next level and starts its episode."""
-        values = self.settings[lane]
-        spawns = NO_LIMIT if self.variant.endless else _limit(values["num_spawns"])
-        level = draw_level(rng, values, self.variant)
-        write_level(self.state, lane, level, spawns)
-        self._furnish(lane)
-        if not level.coins:
-            self._unlocked.append(lane)
+    def begin(self, lanes: np.ndarray) -> None:
+        """Draws the lanes' next levels and starts their episodes."""
+        for lane in lanes.tolist():
+            values = self.settings[lane]
+            spawns = NO_LIMIT if self.variant.endless else _limit(values["num_spawns"])
+            level = draw_level(self._rngs[lane], values, self.variant)
+            write_level(self.state, lane, level, spawns)
+            self._furnish(lane)
+            if not level.coins:
+                self._unlocked.append(lane)
 
     def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One step of the rules: walk, spawn, shine, burn, collect, leave."""
@@ -1216,7 +1207,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
             last = tuple(s.bodies[:, lane, COIN].tolist())
             rewards[lane] += s.reward_coin[lane] * take_coins(s, lane, touched[lane])
             if self.variant.endless:
-                s.bodies[:, lane, COIN] = draw_coin(self._rngs[lane], last)
+                s.bodies[:, lane, COIN] = draw_coin(words(self._rngs[lane]), last)
                 s.left[lane], s.coin_age[lane] = 1, 0
                 aim(s, lane)
             self._furnish(lane)

@@ -21,11 +21,18 @@ def words(rng: np.random.Generator) -> Callable[[], int]:
 
 
 def below(word: Callable[[], int], limit: int) -> int:
-    """What Generator.integers(0, limit) would draw, for a limit from 2 to 2**32 - 1 (Lemire's method)."""
+    """What Generator.integers(0, limit) would draw, for a limit from 1 to 2**32 - 1 (Lemire's method)."""
+    if limit == 1:
+        return 0
     product = word() * limit
     while product & LOW < limit and product & LOW < WORDS % limit:
         product = word() * limit
     return product >> 32
+
+
+def pick(word: Callable[[], int], values: tuple[int, ...]) -> int:
+    """What Generator.choice would draw of these values. It takes no word where there is but one."""
+    return values[below(word, len(values))]
 
 
 class Tape:

@@ -197,6 +197,23 @@ def test_the_largest_agent_leaves_the_screen_at_any_speed(speed):
     assert has(frame, BODY)
 
 
+@pytest.mark.parametrize("scale", [0.25, 0.66, 0.72, 1.0])
+@pytest.mark.parametrize("left", [-30, -1, 0, 1, 2, 5])
+def test_what_shows_of_an_agent_above_the_screen(scale, left):
+    """Its lowest rows: so many are left when it has walked up from the top row."""
+    radius = int(25 * scale)
+    options = {"agent_scale": scale, "agent_speed": 2 * radius - left}
+    env, s = made(ENDLESS, 11, **options)
+    assert path_of(s)[0] == (0, 0)
+    frame, *_ = env.step(2)
+    assert s.pos[0, 1] - PAD == left - radius
+    rows = (frame == BODY).all(axis=-1).any(axis=1).nonzero()[0]
+    assert rows.max(initial=-1) == max(0, left) - 1
+    vectors = gym.make_vec(ENDLESS, num_envs=1, obs_type="vector")
+    vectors.reset(seed=11, options=options)
+    assert bool(vectors.step([2])[0][0, 0]) == (left > 0)
+
+
 # ---- endless episodes ----
 
 

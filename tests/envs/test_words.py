@@ -6,7 +6,18 @@ from numpy.random import MT19937, PCG64, PCG64DXSM, SFC64, Generator, Philox
 
 from memory_gym_envs.words import LOW, PERCENT_AGAIN, Tape, below, words
 
-LIMITS = [2, 3, 7, 8, 49, 100, 2**31, 2**31 + 1, 2**32 - 1]  # one draw in two is repeated for a limit just above 2**31
+LIMITS = [
+    1,
+    2,
+    3,
+    7,
+    8,
+    49,
+    100,
+    2**31,
+    2**31 + 1,
+    2**32 - 1,
+]  # one draw in two is repeated for a limit just above 2**31
 HALVES = pytest.mark.parametrize("kind", [PCG64, PCG64DXSM, SFC64, Philox])
 
 
