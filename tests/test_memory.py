@@ -1,5 +1,7 @@
 """The invariants of a memory: what the update recomputes is what the rollout saw, and nothing leaks."""
 
+import contextlib
+import dataclasses
 import math
 
 import numpy as np
@@ -281,3 +283,33 @@ def test_the_gru_learns_as_the_library_s(layers):
         found.append([*outputs, x.grad, state.grad, *(parameter.grad for parameter in gru.parameters())])
     for got, want in zip(*found, strict=True):
         torch.testing.assert_close(got, want, rtol=0, atol=1e-12)
+
+
+def moved(part, device):
+    """A copy on the device of what is on a GPU when there is one: all but the steps' numbers."""
+    if isinstance(part, torch.Tensor):
+        return part.to(device)
+    if isinstance(part, dict):
+        return {name: moved(each, device) for name, each in part.items()}
+    if isinstance(part, ppo_trxl.Timeline):
+        return dataclasses.replace(part, items=part.items.to(device))
+    return part
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_the_update_waits_for_no_device(played, monkeypatch, memory):
+    """On the meta device, which has shapes and no numbers: whatever asked it for one would fail, as would a mixture."""
+    heads = {"reconstruction_coef": 0.1, "ground_truth_coef": 0.1}
+    args, run, *_ = played(env_id="MortarMayhemB-Grid-v0", iterations=2, **heads, **memory)
+    script = memory.get("script", ppo_gru)
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())  # knows no such device
+    pieces = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated)
+    agent = run.agent.to("meta")
+    rollout = script.Rollout(**{name: moved(part, "meta") for name, part in vars(run.rollout).items()})
+    targets = 2 * (torch.zeros(16, 4, device="meta"),)
+    for minibatch in pieces.minibatches(2):
+        loss, _ = script.minibatch_loss(agent, rollout, targets, minibatch, 0.1, args)
+        loss.backward()
+        nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+        agent.memory.numbers(minibatch, rollout.memory)
+    assert all(parameter.grad.device.type == "meta" for parameter in agent.parameters())
