@@ -665,6 +665,8 @@ class Memory(nn.Module):
 
     def step(self, x: Tensor, live: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Take one step of all lanes: x (N, D) to (N, D), the new live memory, and what to store of this step."""
+        if self.kind == "none":
+            return x, live, live
         y, new_live = self.recur(x[:, None], live)
         return y[:, 0], new_live, live
 
@@ -686,6 +688,8 @@ class Memory(nn.Module):
 
     def unroll(self, x: Tensor, pieces: Pieces, stored: Tensor) -> Tensor:
         """Run whole pieces at once: x (R, D) to (R, D), from the stored (T, N, P, D) memory of their first steps."""
+        if self.kind == "none":
+            return x
         live = stored.flatten(0, 1)[pieces.first.to(x.device)]  # (S, P, D)
         padded = pad_sequence(x.split(pieces.length.tolist()), batch_first=True)  # (S, L, D)
         y, _ = self.recur(padded, live)
@@ -694,8 +698,6 @@ class Memory(nn.Module):
 
     def recur(self, x: Tensor, live: Tensor) -> tuple[Tensor, Tensor]:
         """Run the recurrent layers over x (S, L, D) from the live memory (S, P, D); return both anew."""
-        if self.kind == "none":
-            return x, live
         state = live.transpose(0, 1).contiguous()  # (P, S, D)
         with torch.autocast(x.device.type, enabled=False):  # rounding would add up from step to step
             y, state = self.rnn(x, state if self.kind == "gru" else state.chunk(2))
