@@ -112,7 +112,7 @@ def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, options: dict 
     torch.manual_seed(seed)
     episode = Episode()
     obs, infos = envs.reset(seed=seed, options=options)
-    live = agent.memory.initial(1, torch.device("cpu"), max_steps)
+    live = agent.memory.initial(max_steps, 1, torch.device("cpu"))
     while not episode.finished and len(episode.actions) < max_steps:
         for name, frame in views(envs, obs).items():
             episode.film(name, frame)
@@ -124,7 +124,7 @@ def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, options: dict 
         episode.rewards.append(float(rewards[0]))
         episode.finished = bool(terminated[0] or truncated[0])
     if episode.finished:
-        episode.final = {name: value.item() for name, value in ppo_gru.final_numbers(infos, np.ones(1, bool))}
+        episode.final = {name: values.item() for name, _, values in ppo_gru.final_numbers(infos, np.ones(1, bool))}
     return episode
 
 

@@ -38,7 +38,7 @@ import tyro
 from gymnasium.vector import AutoresetMode
 from torch import Tensor, nn
 from torch.distributions import Categorical
-from torch.nn.utils.rnn import pad_sequence
+from torch.nn.utils.rnn import PackedSequence, pack_sequence, pad_sequence, unpack_sequence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
@@ -61,7 +61,7 @@ class Args:
     amp: bool = False
     """compute the networks in bfloat16, faster on processors that have it; losses stay in float32"""
     compile: bool = False
-    """compile convolutions and heads when training begins: takes a minute, and on a CPU a C++ compiler"""
+    """compile convolutions and heads before training: takes a minute, and on a CPU a C++ compiler"""
     track: bool = False
     """log to Weights and Biases too (needs the extra `track`)"""
     wandb_project_name: str = "memory-gym-baselines"
@@ -138,9 +138,9 @@ class Args:
     """width of the layer behind the memory, and of the heads' own layers"""
 
     eval_interval: int = 0
-    """iterations from one evaluation to the next, on levels that are not trained on (0: none)"""
+    """iterations from one evaluation to the next, and one at the end, on levels that are not trained on (0: none)"""
     eval_levels: int = 50
-    """levels of an evaluation, those that follow the training levels"""
+    """levels of an evaluation: those that follow start_level + num_levels - 1"""
     eval_repeats: int = 3
     """how often an evaluation plays each level"""
     eval_max_steps: int = 10_000
@@ -266,22 +266,24 @@ def first_reset(envs: gym.vector.VectorEnv, seed: int, options: dict | None) -> 
 
 
 def ground_truth_of(infos: dict) -> Tensor:
-    """Return the ground truth (N, G) in the infos; raise ValueError if the environment reports none."""
-    if "ground_truth" not in infos:
-        raise ValueError("--ground-truth-coef needs an environment that has ground_truth in its info; use 0")
-    return torch.as_tensor(infos["ground_truth"], dtype=torch.float32)
+    """Return the ground truth (N, G) in the infos; raise ValueError if the environment reports none of that shape."""
+    truth = np.asarray(infos.get("ground_truth"))
+    if truth.ndim != 2 or truth.dtype.kind not in "biuf":
+        raise ValueError("--ground-truth-coef needs an environment that has ground_truth, an array, in its info; use 0")
+    return torch.as_tensor(truth, dtype=torch.float32)
 
 
 def observation_spaces(space: gym.Space) -> dict[str, gym.spaces.Box]:
     """Name the parts of an observation; raise ValueError for a space that the encoder has no layer for."""
     parts = dict(space.spaces) if isinstance(space, gym.spaces.Dict) else {"observation": space}
     for name, part in parts.items():
-        pixels = isinstance(part, gym.spaces.Box) and len(part.shape) == 3 and min(part.shape[:2]) >= 36
-        vector = isinstance(part, gym.spaces.Box) and len(part.shape) == 1
-        if not pixels and not vector:
+        box = isinstance(part, gym.spaces.Box)
+        pixels = box and len(part.shape) == 3 and min(part.shape[:2]) >= 36
+        pixels = pixels and (part.dtype == np.uint8 or (part.low.min() >= 0 and part.high.max() <= 1))
+        if not pixels and not (box and len(part.shape) == 1):
             raise ValueError(
-                f"the observation space {name}: {part} is not supported; use pixels (height, width, channels) "
-                "of at least 36 x 36, a vector, or a Dict of these"
+                f"the observation space {name}: {part} is not supported; use pixels (height, width, channels) of at "
+                "least 36 x 36, bytes or numbers from 0 to 1, a vector, or a Dict of these"
             )
     return parts
 
@@ -461,8 +463,8 @@ class AtariCNN(nn.Sequential):
     def forward(self, pixels: Tensor) -> Tensor:
         """Encode uint8 pixels, scaled to [0, 1], or float ones as they are."""
         # A CPU's caches want small batches: the backward pass of 2,048 frames at once takes about 1.5 times as long.
-        size = self.chunk if pixels.device.type == "cpu" else 8 * self.chunk
-        # What is compiled is so for one size: the rest of a batch would be compiled anew every time.
+        size = self.chunk if pixels.device.type == "cpu" else len(pixels)
+        # Compiled for a CPU, it is so for one size: the rest of a batch would be compiled anew every time.
         whole, rest = self.convolve, partial(AtariCNN.convolve, self)
         features = [(whole if len(chunk) == size else rest)(chunk) for chunk in pixels.split(size)]
         features = torch.cat(features) if len(features) > 1 else features[0]  # (B, channels, height, width)
@@ -563,69 +565,73 @@ def head(size: int, outputs: int, gain: float) -> nn.Sequential:
 
 # ---- 5 MEMORY ----
 class GRUScan(torch.autograd.Function):
-    """One layer of `nn.GRU` over time, for training on a CPU, where the library's own is about half as fast.
+    """One layer of `nn.GRU` over packed pieces, for learning on a CPU, where the library's own is much slower.
 
-    Takes the projected inputs (L, S, 3D), the first states (S, D) and the recurrent weight and bias; returns the states
-    (L, S, D). What it saves: the weight is turned once instead of at every step, and its gradient is one product of
-    all steps instead of a sum of L small ones. The gates r, z and n are those of torch's documentation of nn.GRU.
+    Takes the projected inputs (R, 3D), the first states (S, D), the recurrent weight and bias, and how many pieces go
+    on at each step, a list; returns the states (R, D). Inputs and states are in a PackedSequence's order: the first
+    step of all pieces, the longest piece first, then the second step of those that have one. What is saved: there is
+    no padding, the weight is turned once instead of at every step, and its gradient is one product of all steps
+    instead of a sum of L small ones. The gates r, z and n are those of torch's documentation of nn.GRU.
     """
 
     @staticmethod
-    def forward(ctx, inputs: Tensor, first: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    def forward(ctx, inputs: Tensor, first: Tensor, weight: Tensor, bias: Tensor, sizes: list[int]) -> Tensor:
         """Run the recurrence, keeping every gate for the way back."""
-        steps, (pieces, width) = len(inputs), first.shape
-        states = torch.cat([first[None], inputs.new_empty(steps, pieces, width)])  # (L + 1, S, D)
-        gates = inputs.clone()  # (L, S, 3D) the projected inputs, step by step overwritten with r, z and n
-        candidates = torch.empty_like(states[1:])  # (L, S, D) the recurrent part of n
-        turned = weight.T.contiguous()
-        for t in range(steps):
-            hidden = torch.addmm(bias, states[t], turned)  # (S, 3D)
-            rz, n = gates[t].split((2 * width, width), -1)
+        width = first.shape[1]
+        gates = inputs.clone()  # (R, 3D) the projected inputs, step by step overwritten with r, z and n
+        states, before, candidates = (inputs.new_empty(len(inputs), width) for _ in range(3))  # (R, D) each
+        turned, state = weight.T.contiguous(), first
+        steps = zip(*(each.split(sizes) for each in (gates, before, candidates, states)), strict=True)
+        for gate, previous, candidate, now in steps:
+            previous.copy_(state[: len(now)])
+            hidden = torch.addmm(bias, previous, turned)  # (rows, 3D)
+            rz, n = gate.split((2 * width, width), -1)
             rz.add_(hidden[:, : 2 * width]).sigmoid_()
-            candidates[t] = hidden[:, 2 * width :]
-            n.addcmul_(rz[:, :width], candidates[t]).tanh_()
-            torch.lerp(n, states[t], rz[:, width:], out=states[t + 1])
-        ctx.save_for_backward(states, gates, candidates, weight)
-        return states[1:]
+            candidate.copy_(hidden[:, 2 * width :])  # the recurrent part of n
+            n.addcmul_(rz[:, :width], candidate).tanh_()
+            state = torch.lerp(n, previous, rz[:, width:], out=now)
+        ctx.save_for_backward(before, gates, candidates, weight)
+        ctx.sizes = sizes
+        return states
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Walk back through the steps: only what depends on the later states is left to the loop."""
-        states, gates, candidates, weight = ctx.saved_tensors
-        r, z, n = gates.chunk(3, -1)  # (L, S, D) each
+        before, gates, candidates, weight = ctx.saved_tensors
+        r, z, n = gates.chunk(3, -1)  # (R, D) each
         to_n = (1 - z) * (1 - n.square())  # what a state's gradient is multiplied with on its way to n's argument
-        to_z = (states[:-1] - n) * z * (1 - z)
+        to_z = (before - n) * z * (1 - z)
         to_r = candidates * r * (1 - r)  # from n's argument on
-        grad_hidden = torch.empty_like(gates)  # (L, S, 3D) of the recurrent product
+        grad_hidden = torch.empty_like(gates)  # (R, 3D) of the recurrent product
         grad_n = torch.empty_like(n)
-        carried = torch.zeros_like(states[0])  # (S, D) the gradient that the later steps send back
-        for t in reversed(range(len(grad))):
-            carried += grad[t]
-            part_r, part_z, part_n = grad_hidden[t].chunk(3, -1)
-            torch.mul(carried, to_n[t], out=grad_n[t])
-            torch.mul(grad_n[t], to_r[t], out=part_r)
-            torch.mul(carried, to_z[t], out=part_z)
-            torch.mul(grad_n[t], r[t], out=part_n)
-            carried = torch.addmm(carried.mul_(z[t]), grad_hidden[t], weight)
-        grad_weight = grad_hidden.flatten(0, 1).T @ states[:-1].flatten(0, 1)  # (3D, D)
-        grad_bias = grad_hidden.sum((0, 1))
+        carried = grad.new_zeros(0, grad.shape[1])  # the gradient that the later steps send back
+        end = len(grad)
+        for size in reversed(ctx.sizes):
+            now, end = slice(end - size, end), end - size
+            total = grad[now].clone()
+            total[: len(carried)] += carried
+            part_r, part_z, part_n = grad_hidden[now].chunk(3, -1)
+            torch.mul(total, to_n[now], out=grad_n[now])
+            torch.mul(grad_n[now], to_r[now], out=part_r)
+            torch.mul(total, to_z[now], out=part_z)
+            torch.mul(grad_n[now], r[now], out=part_n)
+            carried = torch.addmm(total.mul_(z[now]), grad_hidden[now], weight)
+        grad_weight = grad_hidden.T @ before  # (3D, D)
+        grad_bias = grad_hidden.sum(0)
         grad_hidden.chunk(3, -1)[2].copy_(grad_n)  # the inputs' gradient differs in n alone
-        return grad_hidden, carried, grad_weight, grad_bias
+        return grad_hidden, carried, grad_weight, grad_bias, None
 
 
 class GRU(nn.GRU):
-    """`nn.GRU` with the batch first; learns with `GRUScan` on a CPU, with the library's kernels everywhere else."""
+    """`nn.GRU` with the batch first, and a way of its own to learn on a CPU."""
 
-    def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Map x (S, L, D) and the layers' first states (P, S, D) to the last layer's states and all last ones."""
-        if x.device.type != "cpu" or not torch.is_grad_enabled():
-            return super().forward(x, state)
-        x, last = x.transpose(0, 1), []  # (L, S, D)
+    def scan(self, x: PackedSequence, state: Tensor) -> PackedSequence:
+        """Map packed pieces and the layers' first states (P, S, D), in the packed order, to the last layer's states."""
+        data, sizes = x.data, x.batch_sizes.tolist()
         for first, (w_input, w_hidden, b_input, b_hidden) in zip(state, self.all_weights, strict=True):
-            x = GRUScan.apply(F.linear(x, w_input, b_input), first, w_hidden, b_hidden)
-            last.append(x[-1])
-        return x.transpose(0, 1), torch.stack(last)
+            data = GRUScan.apply(F.linear(data, w_input, b_input), first, w_hidden, b_hidden, sizes)
+        return x._replace(data=data)
 
 
 class Memory(nn.Module):
@@ -640,14 +646,14 @@ class Memory(nn.Module):
     def __init__(self, args: Args):
         super().__init__()
         self.seq_len, self.width = args.seq_len, args.hidden_size
-        self.kind = args.memory
+        self.kind, self.packed = args.memory, args.memory == "gru"  # learns from packed pieces, on a CPU
         self.hidden_vectors = args.num_layers * {"gru": 1, "lstm": 2, "none": 0}[args.memory]
         if args.memory != "none":
             rnn = GRU if args.memory == "gru" else nn.LSTM
             # The outputs are activated already: another ReLU behind them would throw half of them away (5.2.4).
             self.rnn = layer_init(rnn(self.width, self.width, args.num_layers, batch_first=True), 1.0)
 
-    def initial(self, lanes: int, device: torch.device, num_steps: int) -> Tensor:
+    def initial(self, num_steps: int, lanes: int, device: torch.device) -> Tensor:
         """Return the live memory (N, P, D) of fresh episodes, the same for rollouts of any length."""
         return torch.zeros(lanes, self.hidden_vectors, self.width, device=device)
 
@@ -691,10 +697,19 @@ class Memory(nn.Module):
         if self.kind == "none":
             return x
         live = stored.flatten(0, 1)[pieces.first.to(x.device)]  # (S, P, D)
-        padded = pad_sequence(x.split(pieces.length.tolist()), batch_first=True)  # (S, L, D)
-        y, _ = self.recur(padded, live)
+        sequences = x.split(pieces.length.tolist())
+        if self.packed and x.device.type == "cpu":
+            return self.scan(sequences, live)
+        y, _ = self.recur(pad_sequence(sequences, batch_first=True), live)  # (S, L, D)
         # The padding ends here: what follows, the losses' means (5.8) included, sees real steps only.
         return y.flatten(0, 1).index_select(0, pieces.slots().to(x.device))
+
+    def scan(self, sequences: tuple[Tensor, ...], live: Tensor) -> Tensor:
+        """Do for pieces what `recur` does for padded ones; return the steps (R, D), piece after piece."""
+        packed = pack_sequence(sequences, enforce_sorted=False)
+        with torch.autocast("cpu", enabled=False):
+            packed = self.rnn.scan(packed, live[packed.sorted_indices].transpose(0, 1))
+        return torch.cat(unpack_sequence(packed))
 
     def recur(self, x: Tensor, live: Tensor) -> tuple[Tensor, Tensor]:
         """Run the recurrent layers over x (S, L, D) from the live memory (S, P, D); return both anew."""
@@ -706,13 +721,13 @@ class Memory(nn.Module):
         return y, state.transpose(0, 1)
 
     def numbers(self, pieces: Pieces, stored: Tensor) -> dict[str, float]:
-        """Return what to log of a minibatch: the share of the padded (S, L) that is padding."""
+        """Return what to log of a rollout's pieces: the share of (S, L) that is padding."""
         return {"padding_fraction": 1 - float(pieces.length.float().mean() / pieces.length.max())}
 
 
 # ---- 6 AGENT ----
 class Agent(nn.Module):
-    """Encoder, memory and heads. Plays step by step with `act`, learns from whole pieces with `evaluate`.
+    """Encoder, memory and heads. Plays step by step with `act`, learns from whole pieces with `unroll`.
 
     ground_truths is how many numbers the environment's ground truth has. Raises ValueError for spaces that it cannot
     encode, act in or draw.
@@ -724,8 +739,9 @@ class Agent(nn.Module):
         self.memory = Memory(args)
         self.encoder = Encoder(spaces, self.memory.width)
         self.heads = Heads(self.memory.width, action_branches(action_space), args.head_size)
-        self.decoder = Decoder(args.head_size, spaces) if args.reconstruction_coef else None
-        self.estimator = head(args.head_size, ground_truths, 1.0) if args.ground_truth_coef else None
+        with torch.random.fork_rng([]):  # what follows from the seed is the same with and without these
+            self.decoder = Decoder(args.head_size, spaces) if args.reconstruction_coef else None
+            self.estimator = head(args.head_size, ground_truths, 1.0) if args.ground_truth_coef else None
 
     def act(self, obs: dict[str, Tensor], live: Any) -> tuple[list[Categorical], Tensor, Any, Any]:
         """Take one step of all lanes: the action distributions, values (N,), new live memory, and what to store."""
@@ -733,7 +749,7 @@ class Agent(nn.Module):
         policy, values, _ = self.heads(x)
         return policy, values, live, stored
 
-    def evaluate(self, obs: dict[str, Tensor], pieces: Pieces, stored: Any) -> tuple[list[Categorical], Tensor, Tensor]:
+    def unroll(self, obs: dict[str, Tensor], pieces: Pieces, stored: Any) -> tuple[list[Categorical], Tensor, Tensor]:
         """Recompute the distributions, values (R,) and features (R, F) of the pieces' steps, in the pieces' order."""
         return self.heads(self.memory.unroll(self.encoder(obs), pieces, stored))
 
@@ -742,18 +758,20 @@ class MemoryLimit(ValueError):
     """A memory cannot hold what it is given; says which flag helps. Raised by `Memory.step`."""
 
 
-def compile_layers(agent: Agent) -> None:
-    """Compile the convolutions, for pieces of their full size, and the heads, for any batch.
+def compile_layers(agent: Agent, obs: dict[str, Tensor]) -> None:
+    """Compile the convolutions, on a CPU for pieces of their full size, and the heads; obs (N, ...) are any.
 
     Raises ValueError if that fails.
     """
+    device = next(agent.parameters()).device
     for cnn in agent.encoder.cnns:
-        cnn.convolve = torch.compile(cnn.convolve, dynamic=False)
+        cnn.convolve = torch.compile(cnn.convolve, dynamic=device.type != "cpu")
     for layers in (agent.heads.trunk, agent.heads.policy, agent.heads.value):
         layers.compile(dynamic=True)
-    device = next(agent.parameters()).device
+    pieces = max((cnn.chunk for cnn in agent.encoder.cnns), default=2)
+    first = {name: part[:1].expand(pieces, *part.shape[1:]) for name, part in on_device(obs, device).items()}
     try:
-        agent.heads(torch.zeros(2, agent.memory.width, device=device))
+        agent.heads(agent.encoder(first))
     except Exception as error:  # whatever the compiler raises
         raise ValueError(f"--compile: {error}; install a C++ compiler (g++), or leave --compile out") from None
 
@@ -801,16 +819,17 @@ def load_model(path: str) -> tuple[Args, dict[str, Tensor]]:
 
 
 def load_weights(agent: Agent, path: str) -> None:
-    """Give the agent the weights in the file.
+    """Give the agent the weights in the file; auxiliary heads may be added to it or left out.
 
     Raises ValueError if they belong to another network or the file holds none, OSError if it cannot be read.
     """
     saved_args, weights = load_model(path)
     try:
-        agent.load_state_dict(weights)
+        missing, unexpected = agent.load_state_dict(weights, strict=False)
+        if not all(name.startswith(("decoder.", "estimator.")) for name in (*missing, *unexpected)):
+            raise RuntimeError
     except (RuntimeError, TypeError):
         shaping = ("env_id", *agent.memory.flags, "head_size", "obs_type", "frame_stack", "step_encoding")
-        shaping += ("reconstruction_coef", "ground_truth_coef")
         flags = [f"{flag(name)} {getattr(saved_args, name)}" for name in shaping]
         raise ValueError(f"{path} holds the weights of another network, trained with {' '.join(flags)}") from None
 
@@ -954,18 +973,19 @@ def note_episodes(play: Play, rewards: np.ndarray, done: np.ndarray, infos: dict
     episodes["charts/episodic_return"] += play.returns[done].tolist()
     episodes["charts/episodic_length"] += play.lengths[done].tolist()
     play.returns[done], play.lengths[done] = 0, 0
-    for name, values in final_numbers(infos, done):
+    for name, _, values in final_numbers(infos, done):
         episodes[f"episode/{name}"] += values.tolist()
 
 
-def final_numbers(infos: dict, lanes: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield each number in the final infos by name, of the given lanes, all of which have just ended an episode."""
+def final_numbers(infos: dict, lanes: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield each number in the final infos of the given lanes: its name, which of them have it (N,), and theirs."""
     final = infos.get("final_info", {})
     for name, values in final.items():
-        if f"_{name}" in final and isinstance(values, np.ndarray) and lanes.any():
-            ended = np.array(values[lanes & final[f"_{name}"]].tolist())
-            if ended.ndim == 1 and ended.dtype.kind in "biuf":
-                yield name, ended
+        which = lanes & final.get(f"_{name}", False)
+        if which.any() and isinstance(values, np.ndarray) and all(np.isscalar(value) for value in values[which]):
+            found = np.array(values[which].tolist())
+            if found.dtype.kind in "biuf":
+                yield name, which, found
 
 
 def minibatch_loss(
@@ -979,7 +999,7 @@ def minibatch_loss(
 
     obs = {name: take(part) for name, part in rollout.obs.items()}
     with autocast(args, steps.device):
-        policy, values, features = agent.evaluate(obs, pieces, rollout.memory)
+        policy, values, features = agent.unroll(obs, pieces, rollout.memory)
     log_ratio = log_probs_of(policy, take(rollout.actions)) - take(rollout.log_probs)  # (R, A)
     entropy = torch.stack([branch.entropy() for branch in policy], -1).sum(-1).mean()
     advantages, returns = map(take, targets)
@@ -1031,24 +1051,33 @@ def update(
     )
     returns = advantages + rollout.values
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
-    logs, numbers = [], []
+    logs = []
     for _ in range(args.update_epochs):
         for minibatch in pieces.minibatches(args.num_minibatches):
             loss, log = minibatch_loss(agent, rollout, (advantages, returns), minibatch, ent_coef, args)
             optimizer.zero_grad()
             loss.backward()
-            log["losses/grad_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+            log["losses/grad_norm"] = clip_gradients(agent, args)
             optimizer.step()
             logs.append(log)
-            numbers.append(agent.memory.numbers(minibatch, rollout.memory))
-        epoch_kl = torch.stack([log["losses/approx_kl"] for log in logs[-args.num_minibatches :]]).mean()
-        if args.target_kl is not None and epoch_kl > args.target_kl:
-            break
+        if args.target_kl is not None:
+            epoch = logs[-args.num_minibatches :]
+            if torch.stack([log["losses/approx_kl"] for log in epoch]).mean() > args.target_kl:
+                break
     means = {name: torch.stack([log[name] for log in logs]).mean().item() for name in logs[0]}
     # Before the first gradient step the weights are the rollout's, and so must be every probability.
     means["losses/ratio_error"] = logs[0]["losses/ratio_error"].item()
     means["losses/explained_variance"] = explained_variance(rollout.values, returns)
-    return means | {f"charts/{name}": float(np.mean([each[name] for each in numbers])) for name in numbers[0]}
+    return means | {f"charts/{name}": value for name, value in agent.memory.numbers(pieces, rollout.memory).items()}
+
+
+def clip_gradients(agent: Agent, args: Args) -> Tensor:
+    """Scale the agent's gradient down to --max-grad-norm, a probe's apart from it; return the agent's norm before."""
+    probe, rest = [], []
+    for name, parameter in agent.named_parameters():
+        (probe if args.ground_truth_detach and name.startswith("estimator.") else rest).append(parameter)
+    nn.utils.clip_grad_norm_(probe, args.max_grad_norm)
+    return nn.utils.clip_grad_norm_(rest, args.max_grad_norm)
 
 
 def explained_variance(values: Tensor, returns: Tensor) -> float:
@@ -1067,28 +1096,27 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
     levels = evaluation_levels(args)
     device, options = next(agent.parameters()).device, reset_options(args.env_id, args.env_options)
     obs, _ = envs.reset(seed=levels, options=options)
-    live = agent.memory.initial(len(levels), device, memory_steps)
+    live = agent.memory.initial(memory_steps, len(levels), device)
     stored = agent.memory.storage(memory_steps, len(levels), device)
     playing = np.ones(len(levels), bool)
     found = {name: np.zeros(len(levels)) for name in ("return", "length", "finished")}
-    for t in range(args.eval_max_steps):
-        if t % memory_steps == 0:
-            with autocast(args, device):
+    with autocast(args, device):
+        for t in range(args.eval_max_steps):
+            if t % memory_steps == 0:
                 live = agent.memory.refresh(live, stored)
-        with autocast(args, device):
             policy, _, live, item = agent.act(on_device(as_tensors(obs), device), live)
-        agent.memory.store(stored, t % memory_steps, item)
-        actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
-        obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
-        done = terminated | truncated
-        live = agent.memory.reset(live, torch.as_tensor(done))
-        found["return"] += rewards * playing
-        found["length"] += playing
-        for name, values in final_numbers(infos, done & playing):
-            found.setdefault(name, np.full(len(levels), np.nan))[done & playing] = values
-        playing &= ~done
-        if not playing.any():
-            break
+            agent.memory.store(stored, t % memory_steps, item)
+            actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
+            obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
+            done = terminated | truncated
+            live = agent.memory.reset(live, torch.as_tensor(done))
+            found["return"] += rewards * playing
+            found["length"] += playing
+            for name, which, values in final_numbers(infos, done & playing):
+                found.setdefault(name, np.full(len(levels), np.nan))[which] = values
+            playing &= ~done
+            if not playing.any():
+                break
     return found | {"finished": 1.0 - playing}
 
 
@@ -1124,32 +1152,43 @@ def setup(args: Args) -> Run:
     device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")  # TF32
-    options = reset_options(args.env_id, args.env_options)
-    envs = make_envs(args, args.num_envs, "debug_rgb_array" if args.capture_video else None)
-    if envs.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
-        raise ValueError(f"{args.env_id} does not reset an ended episode in the same step")
-    obs, infos = first_reset(envs, args.seed, options)
-    agent = make_agent(envs, infos, args, device)
+    with enough_memory(args, device):
+        envs = make_envs(args, args.num_envs, "debug_rgb_array" if args.capture_video else None)
+        if envs.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
+            raise ValueError(f"{args.env_id} does not reset an ended episode in the same step")
+        obs, infos = first_reset(envs, args.seed, reset_options(args.env_id, args.env_options))
+        agent = make_agent(envs, infos, args, device)
+        ground_truth = ground_truth_of(infos) if agent.estimator is not None else None
+        live = agent.memory.initial(args.num_steps, args.num_envs, device)
+        play = Play(obs, ground_truth, live, np.zeros(args.num_envs), np.zeros(args.num_envs, np.int64))
+        rollout = make_rollout(agent, play, args.num_steps, device)
+        eval_envs = make_envs(args, len(evaluation_levels(args))) if args.eval_interval else None
     if args.load_model is not None:
         load_weights(agent, args.load_model)
     if args.compile:
-        compile_layers(agent)
+        compile_layers(agent, obs)
     optimizer = torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)
-    ground_truth = ground_truth_of(infos) if agent.estimator is not None else None
-    try:
-        live = agent.memory.initial(args.num_envs, device, args.num_steps)
-        play = Play(obs, ground_truth, live, np.zeros(args.num_envs), np.zeros(args.num_envs, np.int64))
-        rollout = make_rollout(agent, play, args.num_steps, device)
-    except (MemoryError, RuntimeError):
-        size = f"--num-envs {args.num_envs} x --num-steps {args.num_steps}"
-        raise ValueError(f"a rollout of {size} does not fit in the memory of {device}; use fewer of either") from None
-    eval_envs = make_envs(args, len(evaluation_levels(args))) if args.eval_interval else None
 
     folder = new_folder(args)
     recorder = LaneRecorder(envs, os.path.join(folder, "videos")) if args.capture_video else None
     if args.track:
         start_tracking(args, os.path.basename(folder))
     return Run(envs, eval_envs, agent, optimizer, rollout, play, recorder, folder, open_writer(args, folder))
+
+
+@contextlib.contextmanager
+def enough_memory(args: Args, device: torch.device) -> Iterator[None]:
+    """Raise ValueError, naming what is larger than usual, if what is made inside does not fit in the memory."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "memory" not in str(error):
+            raise
+        numbers = [(each, getattr(args, each.name)) for each in fields(Args) if type(each.default) is int]
+        large = [f"{flag(each.name)} {value}" for each, value in numbers if value > each.default]
+        large = [name for name in large if not name.startswith(("--seed", "--total", "--start", "--anneal"))]
+        large = " ".join(large) or f"--num-envs {args.num_envs} --num-steps {args.num_steps}"
+        raise ValueError(f"this does not fit in the memory of {device}; use less of {large}") from None
 
 
 def new_folder(args: Args) -> str:
@@ -1170,7 +1209,7 @@ def open_writer(args: Args, folder: str) -> SummaryWriter:
     except OSError as error:
         raise OSError(f"cannot make {folder} ({error.strerror}); run where the folder runs can be written") from None
     writer = SummaryWriter(folder)
-    rows = "\n".join(f"|{key}|{value}|" for key, value in asdict(args).items())
+    rows = "\n".join(f"|{key}|{' '.join(str(value).split())}|" for key, value in asdict(args).items())
     writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
     return writer
 
@@ -1198,16 +1237,18 @@ def train(args: Args, run: Run) -> str:
     """
     recent = {"return": deque(maxlen=100), "length": deque(maxlen=100)}
     batch_size = args.num_envs * args.num_steps
-    iterations, start = args.total_timesteps // batch_size, time.perf_counter()
+    iterations, seconds = args.total_timesteps // batch_size, 0.0
     bar = tqdm(total=iterations * batch_size, unit=" steps", unit_scale=True)
     try:
         with bar, contextlib.suppress(KeyboardInterrupt):
             for iteration in range(1, iterations + 1):
+                began = time.perf_counter()
                 scalars, episodes = iterate(args, run, (iteration - 1) * batch_size)
+                seconds += time.perf_counter() - began
                 if run.eval_envs is not None and (iteration % args.eval_interval == 0 or iteration == iterations):
                     scalars |= evaluation_scalars(run, args)
                 step = iteration * batch_size
-                scalars["charts/SPS"] = step / (time.perf_counter() - start)
+                scalars["charts/SPS"] = step / seconds
                 for name, value in scalars.items():
                     run.writer.add_scalar(name, value, step)
                 for name, window in recent.items():

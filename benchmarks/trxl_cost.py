@@ -82,7 +82,7 @@ def step_times(config: Config, window: int) -> tuple[float, float]:
     """Return the median seconds of a step of the memory with a full window, and of its attention alone."""
     args = ppo_trxl.Args(trxl_memory_length=window, num_steps=config.repeats)
     memory = ppo_trxl.Memory(args)
-    live = memory.initial(args.num_envs, torch.device("cpu"), args.num_steps)
+    live = memory.initial(args.num_steps, args.num_envs, torch.device("cpu"))
     live.steps += window
     x = torch.randn(args.num_envs, memory.width)
     split = memory.blocks[0].attention.split

@@ -1,5 +1,8 @@
 """The auxiliary heads (5.1.2, 5.1.3): what they draw and estimate, which steps they learn from, whom they teach."""
 
+import dataclasses
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -57,7 +60,7 @@ def test_the_losses_are_means_over_real_steps(played, script):
     assert sorted(order.tolist()) == list(range(64))  # every step once, no padding
     obs = {name: part.flatten(0, 1)[order] for name, part in run.rollout.obs.items()}
     with torch.no_grad():
-        features = run.agent.evaluate(obs, pieces, run.rollout.memory)[2]
+        features = run.agent.unroll(obs, pieces, run.rollout.memory)[2]
         drawn = torch.sigmoid(run.agent.decoder(features))
         wanted = obs["visual_observation"] / 255
         truths = run.rollout.ground_truth.flatten(0, 1)[order]
@@ -96,12 +99,33 @@ def test_a_probe_teaches_nobody_else(played, script):
     assert found[True]["estimator.0.weight"].abs().sum() > 0
 
 
+@SCRIPTS
+def test_a_run_with_a_probe_is_the_run_without(tiny, scalars, script):
+    """To the last bit, however much the probe's loss weighs: the gradient's clipping does not see it."""
+    args = tiny(script, env_id="MortarMayhem-Grid-v0", obs_type="vector", ground_truth_detach=True)
+    without, probed = (
+        scalars(script.main(dataclasses.replace(args, exp_name=name, ground_truth_coef=coef)))
+        for name, coef in (("without", 0.0), ("probed", 100.0))
+    )
+    assert probed["losses/ground_truth_loss"][0] > 0
+    for name in set(without) - {"charts/SPS", "losses/loss"}:
+        assert probed[name] == without[name], name
+
+
 def test_heads_that_are_off_cost_nothing(played):
     plain = Agent(gym.spaces.Box(0, 255, (84, 84, 3), np.uint8), gym.spaces.Discrete(4), Args())
     assert plain.decoder is plain.estimator is None
     args, run, *_ = played(env_id="CueRecall-v0")
     assert run.rollout.ground_truth is None
     assert not {name for name in loss_of(ppo_gru, args, run)[1] if "reconstruction" in name or "truth" in name}
+
+
+def test_a_head_can_be_added_to_a_trained_agent(tiny):
+    """A probe after the training (5.1.2): the agent is the saved one, the head is new."""
+    (path,) = Path(ppo_gru.main(tiny(env_id="MortarMayhem-Grid-v0", save_model=True))).glob("model.pt")
+    run = ppo_gru.setup(tiny(env_id="MortarMayhem-Grid-v0", load_model=str(path), ground_truth_coef=0.1))
+    weights = ppo_gru.load_model(str(path))[1]
+    assert all(run.agent.state_dict()[name].equal(weight) for name, weight in weights.items())
 
 
 @SCRIPTS
@@ -118,7 +142,7 @@ def test_both_losses_fall(tiny, scalars, script):
     [
         (
             {"env_id": "CueRecall-v0", "ground_truth_coef": 0.1},
-            "needs an environment that has ground_truth in its info",
+            "needs an environment that has ground_truth, an array",
         ),
         ({"env_id": "CueRecall-v0", "reconstruction_coef": 0.1}, "needs an observation with one picture, not 0"),
         ({"reconstruction_coef": -1.0}, "--reconstruction-coef is -1.0; it must be a number from 0"),

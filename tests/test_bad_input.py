@@ -97,12 +97,17 @@ def test_as_many_minibatches_as_steps_without_memory(tiny):
     ppo_gru.check_args(tiny(memory="none", num_minibatches=64))
 
 
-def test_a_rollout_that_does_not_fit(tiny, monkeypatch):
+@pytest.mark.parametrize("error", [RuntimeError("not enough memory: you tried to allocate a lot"), MemoryError()])
+def test_what_does_not_fit(tiny, monkeypatch, error):
     def full(*_):
-        raise RuntimeError("not enough memory: you tried to allocate a lot")
+        raise error
 
     monkeypatch.setattr(ppo_gru, "make_rollout", full)
-    assert re.search("does not fit in the memory of cpu; use fewer", setup_error(tiny(env_id="CueRecall-v0")))
+    message = setup_error(tiny(env_id="CueRecall-v0", num_envs=128, frame_stack=7))
+    assert message == "this does not fit in the memory of cpu; use less of --frame-stack 7 --num-envs 128"
+    monkeypatch.setattr(ppo_gru, "make_rollout", lambda *_: 1 / torch.zeros(1, 2) @ torch.zeros(1))
+    with pytest.raises(RuntimeError, match=r"size mismatch|shapes"):  # a defect of the program is told as one
+        ppo_gru.setup(tiny(env_id="CueRecall-v0"))
 
 
 def test_tracking_that_does_not_start(tiny, monkeypatch):

@@ -107,7 +107,7 @@ def test_the_episode_is_the_agents(saved):
     view, truth = map(frames_of, page["videos"])
     torch.manual_seed(3)
     obs, infos = envs.reset(seed=3)
-    live = agent.memory.initial(1, torch.device("cpu"), 60)
+    live = agent.memory.initial(60, 1, torch.device("cpu"))
     for t, actions in enumerate(episode.actions):
         assert np.array_equal(view[t], obs[0])
         envs.render_mode = "debug_rgb_array"

@@ -34,7 +34,7 @@ def recompute(run):
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
     steps = pieces.steps()
     obs = {name: part.flatten(0, 1)[steps] for name, part in rollout.obs.items()}
-    policy, values, _ = run.agent.evaluate(obs, pieces, rollout.memory)
+    policy, values, _ = run.agent.unroll(obs, pieces, rollout.memory)
     log_probs = ppo_gru.log_probs_of(policy, rollout.actions.flatten(0, 1)[steps])
     return steps, (log_probs - rollout.log_probs.flatten(0, 1)[steps]).exp(), values
 
@@ -109,6 +109,7 @@ def gradients(agent):
 @pytest.mark.parametrize("fill", [1e6, float("nan")])
 def test_padding_changes_nothing(played, memory, fill, monkeypatch):
     args, run, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
+    run.agent.memory.packed = False  # as on a GPU; packed pieces have no padding
     rollout = run.rollout
     targets = rollout.rewards - rollout.values, rollout.rewards
 
@@ -165,7 +166,7 @@ def test_an_episode_s_first_step_is_the_same_whatever_came_before(played, memory
     _, run, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
     agent, live = run.agent, run.play.live
     obs = {"observation": torch.randn(4, 3)}
-    fresh = agent.act(obs, agent.memory.initial(4, torch.device("cpu"), 16))[1]
+    fresh = agent.act(obs, agent.memory.initial(16, 4, torch.device("cpu")))[1]
     forgotten = agent.memory.reset(live, torch.tensor([True, True, True, False]))
     values = agent.act(obs, forgotten)[1]
     torch.testing.assert_close(values[:3], fresh[:3], atol=1e-6, rtol=0)
@@ -176,11 +177,12 @@ def test_the_encoder_sees_each_step_once_an_epoch_and_no_padding(played, monkeyp
     args, run, last_value, _ = played(env_id="CueRecall-v0")
     rows, runs = [], []
     run.agent.encoder.register_forward_pre_hook(lambda _, inputs: rows.append(len(inputs[0]["observation"])))
-    recur = run.agent.memory.recur
-    monkeypatch.setattr(run.agent.memory, "recur", lambda x, live: (runs.append(1), recur(x, live))[1])
+    for way in ("recur", "scan"):
+        unroll = getattr(run.agent.memory, way)
+        monkeypatch.setattr(run.agent.memory, way, lambda x, live, unroll=unroll: (runs.append(1), unroll(x, live))[1])
     ppo_gru.update(run.agent, run.optimizer, run.rollout, last_value, 0.0, args)
     assert sum(rows) == args.update_epochs * args.num_envs * args.num_steps
-    assert len(runs) == args.update_epochs * args.num_minibatches, "no loop over time"
+    assert len(runs) == args.update_epochs * args.num_minibatches, "all pieces of a minibatch at once"
     rows.clear()
     ppo_gru.collect(run.agent, run.envs, run.play, run.rollout, args, None)
     assert rows == [args.num_envs] * (args.num_steps + 1), "no loop over lanes"
@@ -274,15 +276,28 @@ def test_the_gru_learns_as_the_library_s(layers):
     found = []
     for gru in (ours, library):
         generator = torch.Generator().manual_seed(3)
-        x, state, *wanted = (
-            torch.randn(shape, dtype=torch.float64, generator=generator, requires_grad=True)
-            for shape in ((4, 9, 5), (layers, 4, 5), (4, 9, 5), (layers, 4, 5))
+        shapes = [(length, 5) for length in (3, 9, 1, 9, 4)] + [(layers, 5, 5), (26, 5)]
+        *pieces, state, wanted = (
+            torch.randn(shape, dtype=torch.float64, generator=generator, requires_grad=True) for shape in shapes
         )
-        outputs = gru(x, state)
-        sum((got * want).sum() for got, want in zip(outputs, wanted, strict=True)).backward()
-        found.append([*outputs, x.grad, state.grad, *(parameter.grad for parameter in gru.parameters())])
+        packed = nn.utils.rnn.pack_sequence(pieces, enforce_sorted=False)
+        if gru is ours:  # whose states are in the packed order
+            y = gru.scan(packed, state[:, packed.sorted_indices])
+        else:
+            y, _ = gru(packed, state)
+        y = torch.cat(nn.utils.rnn.unpack_sequence(y))
+        (y * wanted).sum().backward()
+        found.append([y, state.grad, *(piece.grad for piece in pieces), *(weight.grad for weight in gru.parameters())])
     for got, want in zip(*found, strict=True):
         torch.testing.assert_close(got, want, rtol=0, atol=1e-12)
+
+
+def test_packed_or_padded_is_the_same(played):
+    _, run, *_ = played(iterations=2, env_id="CueRecall-v0", num_layers=2)
+    packed = recompute(run)
+    run.agent.memory.packed = False
+    for got, want in zip(packed, recompute(run), strict=True):
+        torch.testing.assert_close(got, want, rtol=0, atol=1e-6)
 
 
 def moved(part, device):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+import ppo_trxl
 from ppo_gru import Agent, Args, AtariCNN, action_branches, observation_spaces, to_env_actions
 
 PIXELS = gym.spaces.Box(0, 255, (84, 84, 3), np.uint8)
@@ -13,6 +14,12 @@ PIXELS = gym.spaces.Box(0, 255, (84, 84, 3), np.uint8)
 def test_parameter_count_of_the_gru_agent_on_endless_mystery_path():
     agent = Agent(PIXELS, gym.spaces.Discrete(4), Args())
     assert sum(p.numel() for p in agent.parameters()) == 4_048_549  # thesis 6.1.1: about 4.05 million
+
+
+def test_parameter_counts_of_the_transformers():
+    """Thesis 6.1.1 has 2.8 million, with projections of a head's width that all heads share, and 9.4 with gates."""
+    agents = [ppo_trxl.Agent(PIXELS, gym.spaces.Discrete(4), ppo_trxl.Args(trxl_gate=gate)) for gate in ("none", "gru")]
+    assert [sum(p.numel() for p in agent.parameters()) for agent in agents] == [4_226_597, 9_537_317]
 
 
 def test_sizes_of_table_6_2():
@@ -64,6 +71,7 @@ def test_actions_as_the_environments_take_them():
         gym.spaces.Discrete(3),
         gym.spaces.Box(0, 1, (84, 84), np.float32),
         gym.spaces.Box(0, 255, (20, 20, 3), np.uint8),
+        gym.spaces.Box(0, 255, (84, 84, 3), np.float32),
         gym.spaces.Dict(a=gym.spaces.Text(3)),
     ],
 )

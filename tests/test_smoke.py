@@ -86,6 +86,19 @@ def test_other_settings(tiny, scalars):
     assert set(curves["episode/solved"]) == {1.0}
 
 
+def test_only_numbers_of_the_lanes_that_have_them():
+    """Not every ended episode tells every number, and some tell lists and words."""
+    lists = np.empty(3, object)
+    lists[:] = [[1], [1, 2], None]
+    final = {"coins": np.array([4.0, 0.0, 6.0]), "_coins": np.array([True, False, True])}
+    final |= {"visited": lists, "_visited": np.array([True, True, False])}
+    final |= {"word": np.array(["a", "b", "c"]), "_word": np.ones(3, bool)}
+    final |= {"nested": {"x": np.zeros(3), "_x": np.ones(3, bool)}, "_nested": np.ones(3, bool)}
+    ((name, which, values),) = ppo_gru.final_numbers({"final_info": final}, np.array([True, True, False]))
+    assert (name, which.tolist(), values.tolist()) == ("coins", [True, False, False], [4.0])
+    assert list(ppo_gru.final_numbers({}, np.ones(3, bool))) == []
+
+
 def test_no_finished_episode_yet(tiny, scalars):
     curves = scalars(ppo_gru.main(tiny(num_steps=8, total_timesteps=32)))
     assert curves.keys() >= CURVES

@@ -95,7 +95,7 @@ def test_unroll_equals_a_window_gathered_for_every_sample(changes):
 def test_playing_equals_unrolling(encoding, window):
     """Three rollouts, refreshed in between: an episode of lane 0 spans them all, others end inside them."""
     memory = make_memory(trxl_positional_encoding=encoding, trxl_memory_length=window, trxl_pe_length=80)
-    live, stored = memory.initial(LANES, torch.device("cpu"), STEPS), memory.storage(STEPS, LANES, torch.device("cpu"))
+    live, stored = memory.initial(STEPS, LANES, torch.device("cpu")), memory.storage(STEPS, LANES, torch.device("cpu"))
     live.keys, live.values, stored.items = live.keys.double(), live.values.double(), stored.items.double()
     generator = torch.Generator().manual_seed(3)
     for _ in range(3):
@@ -172,7 +172,7 @@ def test_attention_equals_the_library_s():
 
 def test_attention_of_a_step():
     memory = make_memory(trxl_positional_encoding="relative")
-    live = memory.initial(LANES, torch.device("cpu"), STEPS)
+    live = memory.initial(STEPS, LANES, torch.device("cpu"))
     live.keys, live.values = live.keys.double(), live.values.double()
     for t in range(9):
         x = torch.randn(LANES, WIDTH, dtype=torch.float64)
@@ -209,7 +209,7 @@ def test_what_is_not_seen_changes_nothing(encoding, fill):
 
 def test_a_forgotten_episode_leaves_nothing_in_the_cache():
     memory = make_memory()
-    live = memory.initial(2, torch.device("cpu"), STEPS)
+    live = memory.initial(STEPS, 2, torch.device("cpu"))
     live.keys, live.values = live.keys.double(), live.values.double()
     with torch.no_grad():
         for _ in range(4):
@@ -222,7 +222,7 @@ def test_a_forgotten_episode_leaves_nothing_in_the_cache():
 
 def test_taking_a_step_again_changes_nothing():
     memory = make_memory()
-    live = memory.initial(LANES, torch.device("cpu"), STEPS)
+    live = memory.initial(STEPS, LANES, torch.device("cpu"))
     live.keys, live.values = live.keys.double(), live.values.double()
     with torch.no_grad():
         for _ in range(8):
@@ -236,7 +236,7 @@ def test_taking_a_step_again_changes_nothing():
 def test_episodes_longer_than_a_learned_encoding():
     for encoding in ENCODINGS:
         memory = make_memory(trxl_positional_encoding=encoding, trxl_pe_length=6)
-        live = memory.initial(1, torch.device("cpu"), STEPS)
+        live = memory.initial(STEPS, 1, torch.device("cpu"))
         live = Live(live.now, live.steps + 5, live.keys.double(), live.values.double())
         with torch.no_grad():
             _, live, _ = memory.step(torch.randn(1, WIDTH).double(), live)
