@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 import ppo_gru
+import ppo_trxl
 
 ROOT = Path(ppo_gru.__file__).parent
 
@@ -32,6 +33,9 @@ def test_readme_names_what_exists():
     readme = (ROOT / "README.md").read_text()
     for path in re.findall(r"\]\(((?:docs|benchmarks)/[^)]+)\)", readme) + re.findall(r"python (\S+\.py)", readme):
         assert (ROOT / path).exists(), path
-    flags = {ppo_gru.flag(name) for name in ppo_gru.Args.__dataclass_fields__}
-    for line in re.findall(r"python ppo_gru\.py (--.*)", readme):
-        assert set(re.findall(r"--[a-z-]+", line)) <= flags | {"--help"}
+    for script in (ppo_gru, ppo_trxl):
+        flags = {script.flag(name) for name in script.Args.__dataclass_fields__}
+        lines = re.findall(rf"python {script.__name__}\.py (--[^`\n]*)", readme)
+        assert len(lines) > 5
+        for line in lines:
+            assert set(re.findall(r"--[a-z-]+", line)) <= flags | {"--help"}, line

@@ -1,0 +1,189 @@
+"""Does memory matter? Trains agents with and without it on two small tasks, and tabulates what they reach.
+
+    python benchmarks/learning.py --jobs 2 --out docs/learning
+
+Vector observations and small networks, so that a run takes minutes on a core. Every agent sees the same vectors, the
+stack the last four of them. Scores are those of evaluations during training, on levels outside the training set
+(6.1.3). A run that is there already, whole, is not trained again.
+"""
+
+import glob
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import evaluate
+
+ROOT = Path(__file__).parent.parent
+COMMON = (
+    "--obs-type vector --head-size 128 --num-steps 128 --num-minibatches 8 --update-epochs 4 --clip-coef 0.2 "
+    "--max-grad-norm 0.5 --gamma 0.99 --save-model"
+)
+AGENTS = {
+    "no memory": "ppo_gru.py --memory none --hidden-size 128",
+    "stack of 4": "ppo_gru.py --memory none --hidden-size 128 --frame-stack 4",
+    "GRU": "ppo_gru.py --memory gru --hidden-size 128",
+    "TrXL": "ppo_trxl.py --trxl-dim 64 --trxl-num-layers 2 --trxl-memory-length 128",
+}
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task that is learned within minutes, and how."""
+
+    env_id: str
+    options: dict
+    metric: str  # the family's own (6.1.3)
+    total_timesteps: int
+    flags: str
+
+
+TASKS = {
+    "mortar-mayhem": Task(
+        "MortarMayhem-Grid-v0",
+        # Four commands instead of ten, each shown for one step, and two thirds of the time to carry one out.
+        {
+            "command_count": [4],
+            "command_show_duration": [1],
+            "command_show_delay": [0],
+            "explosion_delay": [4],
+            "explosion_duration": [2],
+        },
+        "commands_completed",
+        2_000_000,
+        "--num-envs 32 --init-lr 1e-3 --final-lr 1e-4 --init-ent-coef 0.01 --final-ent-coef 0.001",
+    ),
+    "mystery-path": Task(
+        "MysteryPath-Grid-v0",
+        # All paths begin at the left, and each of their tiles pays a tenth of the goal's reward when first reached:
+        # without this, chance finds too few goals.
+        {"cardinal_origin_choice": [0], "reward_path_progress": 0.1},
+        "success",
+        3_000_000,
+        "--num-envs 32 --init-lr 7e-4 --final-lr 1e-4 --init-ent-coef 0.003 --final-ent-coef 0.0001",
+    ),
+}
+
+
+@dataclass
+class Config:
+    """What to train and to draw."""
+
+    tasks: tuple[str, ...] = tuple(TASKS)
+    """of those that this program knows"""
+    agents: tuple[str, ...] = tuple(AGENTS)
+    """of those that this program knows"""
+    seeds: tuple[int, ...] = (1, 2, 3)
+    """a training run each"""
+    jobs: int = 1
+    """runs at the same time; they share the cores"""
+    evaluations: int = 20
+    """points of a curve"""
+    folder: Path = Path("learning")
+    """where the runs go"""
+    out: Path = Path("learning/curves")
+    """draw the curves to OUT.png and OUT.svg"""
+
+
+def command(task: Task, agent: str, seed: int, evaluations: int) -> list[str]:
+    """Return the command line of a training run."""
+    script, *memory = AGENTS[agent].split()
+    flags = [*memory, *COMMON.split(), *task.flags.split()]
+    lanes = int(flags[flags.index("--num-envs") + 1])
+    iterations = task.total_timesteps // (lanes * int(flags[flags.index("--num-steps") + 1]))
+    every = str(max(1, iterations // evaluations))
+    length = ["--total-timesteps", str(task.total_timesteps), "--anneal-steps", str(task.total_timesteps)]
+    what = ["--env-id", task.env_id, "--env-options", json.dumps(task.options)]
+    name = ["--exp-name", agent.replace(" ", "-"), "--seed", str(seed), "--eval-interval", every]
+    return [sys.executable, str(ROOT / script), *what, *name, *flags, *length]
+
+
+def folder_of(config: Config, task: Task, agent: str, seed: int) -> str | None:
+    """Return the folder of a run that came to its end, if there is one: it was evaluated then."""
+    for folder in sorted(glob.glob(f"{config.folder}/runs/{task.env_id}__{agent.replace(' ', '-')}__{seed}__*")):
+        run = EventAccumulator(folder, size_guidance={"scalars": 0})
+        run.Reload()
+        evaluated = run.Tags()["scalars"] and f"eval/{task.metric}" in run.Tags()["scalars"]
+        if evaluated and run.Scalars(f"eval/{task.metric}")[-1].step > 0.99 * task.total_timesteps:
+            return folder
+    return None
+
+
+def train(config: Config, task: Task, agent: str, seed: int) -> None:
+    """Run a training, its output in a file beside the runs; raise SystemExit that names the file if it fails."""
+    threads = str(max(1, (os.cpu_count() or 1) // config.jobs))
+    log = config.folder / f"{task.env_id}-{agent.replace(' ', '-')}-{seed}.log"
+    environment = {**os.environ, "OMP_NUM_THREADS": threads, "TQDM_MININTERVAL": "10"}
+    with log.open("w") as output:
+        line = command(task, agent, seed, config.evaluations)
+        if subprocess.run(line, cwd=config.folder, env=environment, stdout=output, stderr=output).returncode:
+            raise SystemExit(f"{agent} on {task.env_id}, seed {seed}, failed: see {log}")
+    print(f"trained {agent} on {task.env_id}, seed {seed}", flush=True)
+
+
+def curves(folders: list[str], metric: str) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield, of each run, the steps, the seconds since it began, and the scores at its evaluations, (P,) each.
+
+    The seconds include the evaluations.
+    """
+    for folder in folders:
+        run = EventAccumulator(folder, size_guidance={"scalars": 0})
+        run.Reload()
+        points = run.Scalars(f"eval/{metric}")
+        began = run.Tensors("hyperparameters/text_summary")[0].wall_time
+        rows = [(point.step, point.wall_time - began, point.value) for point in points]
+        yield tuple(np.array(rows).T)
+
+
+def row(agent: str, folders: list[str], metric: str, best: float) -> str:
+    """Return the agent's row: its last score, and what it took to nine tenths of the best score of all agents."""
+    steps, seconds, scores = map(np.stack, zip(*curves(folders, metric), strict=True))  # (R, P) each
+    last, ends = evaluate.iqm(scores[:, -1:]), evaluate.interval(scores[:, -1:])
+    middle = evaluate.iqm(scores.T[..., None])  # (P,)
+    reached = np.flatnonzero(middle >= 0.9 * best)
+    taken = ("never", "")
+    if reached.size:
+        taken = (f"{steps[0, reached[0]]:,.0f}", f"{seconds[:, reached[0]].mean():.0f}")
+    span = "none: one seed" if ends is None else "{:.2f} to {:.2f}".format(*ends)
+    whole = f"{seconds[:, -1].mean():.0f}"
+    return f"| {agent} | {len(folders)} | {last:.2f} | {span} | {taken[0]} | {taken[1]} | {whole} |"
+
+
+def report(config: Config, name: str) -> None:
+    """Print a task's table."""
+    task = TASKS[name]
+    folders = {agent: [folder_of(config, task, agent, seed) for seed in config.seeds] for agent in config.agents}
+    scores = [evaluate.iqm(np.stack([c[2][-1:] for c in curves(each, task.metric)])) for each in folders.values()]
+    print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {task.total_timesteps:,} steps\n")
+    print("| agent | seeds | IQM | 95 % interval | steps to 0.9 of the best | seconds | seconds in all |")
+    print("|---|---:|---:|---|---:|---:|---:|")
+    for agent, each in folders.items():
+        print(row(agent, each, task.metric, float(max(scores))))
+
+
+def main(config: Config) -> None:
+    """Train what is missing, then print the tables and draw the curves."""
+    for given, known in ((config.tasks, TASKS), (config.agents, AGENTS)):
+        if unknown := [name for name in given if name not in known]:
+            raise SystemExit(f"there is no {unknown[0]}; there are {', '.join(known)}")
+    config.folder.mkdir(parents=True, exist_ok=True)
+    wanted = [(TASKS[task], agent, seed) for task in config.tasks for seed in config.seeds for agent in config.agents]
+    missing = [run for run in wanted if folder_of(config, *run) is None]
+    with ThreadPoolExecutor(config.jobs) as pool:
+        list(pool.map(lambda run: train(config, *run), missing))
+    for task in config.tasks:
+        report(config, task)
+    evaluate.draw_curves(evaluate.Config(curves=tuple(folder_of(config, *run) for run in wanted), out=str(config.out)))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
