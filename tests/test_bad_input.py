@@ -103,10 +103,13 @@ def test_what_does_not_fit(tiny, monkeypatch, error):
         raise error
 
     monkeypatch.setattr(ppo_gru, "make_rollout", full)
-    message = setup_error(tiny(env_id="CueRecall-v0", num_envs=128, frame_stack=7))
+    message = setup_error(tiny(env_id="CueRecall-v0", num_envs=128, frame_stack=7, total_timesteps=4096))
     assert message == "this does not fit in the memory of cpu; use less of --frame-stack 7 --num-envs 128"
-    monkeypatch.setattr(ppo_gru, "make_rollout", lambda *_: 1 / torch.zeros(1, 2) @ torch.zeros(1))
-    with pytest.raises(RuntimeError, match=r"size mismatch|shapes"):  # a defect of the program is told as one
+
+
+def test_a_defect_is_told_as_one(tiny, monkeypatch):
+    monkeypatch.setattr(ppo_gru, "make_rollout", lambda *_: torch.zeros(1, 2) @ torch.zeros(1))
+    with pytest.raises(RuntimeError, match="size"):
         ppo_gru.setup(tiny(env_id="CueRecall-v0"))
 
 

@@ -65,6 +65,7 @@ def test_no_piece_spans_an_episode_s_end():
 @pytest.mark.parametrize("seq_len", [0, 8])
 def test_padded_length_is_the_longest_piece(seq_len, monkeypatch):
     memory = Memory(Args(hidden_size=4, seq_len=seq_len))
+    memory.packed = False  # packed pieces have no padding
     seen = []
     recur = memory.recur
     monkeypatch.setattr(memory, "recur", lambda x, live: (seen.append(x.shape), recur(x, live))[1])
