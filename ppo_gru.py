@@ -409,6 +409,17 @@ def reconstruction_loss(logits: Tensor, pixels: Tensor) -> Tensor:
     return F.binary_cross_entropy_with_logits(logits, pixels / 255 if pixels.dtype == torch.uint8 else pixels)
 
 
+def first_alike(obs: dict[str, Tensor]) -> Tensor:
+    """Return, for every step of a rollout, the flat index (T * N,) of the first step with the same observation.
+
+    Takes each part (T, N, ...), on the CPU. The same are those whose bytes have the same 64-bit hash.
+    """
+    first: dict[int, int] = {}
+    steps = zip(*(part.flatten(0, 1).numpy() for part in obs.values()), strict=True)
+    hashes = (hash(tuple(part.tobytes() for part in step)) for step in steps)
+    return torch.tensor([first.setdefault(each, index) for index, each in enumerate(hashes)])
+
+
 @dataclass
 class Pieces:
     """Runs of consecutive steps of one lane each. Step t of lane n has the flat index t * N + n."""
@@ -749,9 +760,14 @@ class Agent(nn.Module):
         policy, values, _ = self.heads(x)
         return policy, values, live, stored
 
-    def unroll(self, obs: dict[str, Tensor], pieces: Pieces, stored: Any) -> tuple[list[Categorical], Tensor, Tensor]:
-        """Recompute the distributions, values (R,) and features (R, F) of the pieces' steps, in the pieces' order."""
-        return self.heads(self.memory.unroll(self.encoder(obs), pieces, stored))
+    def unroll(
+        self, obs: dict[str, Tensor], which: Tensor, pieces: Pieces, stored: Any
+    ) -> tuple[list[Categorical], Tensor, Tensor]:
+        """Recompute the distributions, values (R,) and features (R, F) of the pieces' steps, in the pieces' order.
+
+        which (R,) is the row of obs that each step observed.
+        """
+        return self.heads(self.memory.unroll(self.encoder(obs).index_select(0, which), pieces, stored))
 
 
 class MemoryLimit(ValueError):
@@ -849,6 +865,7 @@ class Rollout:
     truncation_values: Tensor  # (T, N) value of the final observation, where bootstrapped
     ground_truth: Tensor | None  # (T, N, G), if it is estimated
     memory: Any  # what the memory stores of the steps
+    alike: Tensor  # (T * N,) flat index of the step whose observation stands for this one's, on the CPU
 
 
 @dataclass
@@ -881,6 +898,7 @@ def make_rollout(agent: Agent, play: Play, num_steps: int, device: torch.device)
         truncation_values=empty(),
         ground_truth=empty(play.ground_truth.shape[1]) if play.ground_truth is not None else None,
         memory=agent.memory.storage(num_steps, lanes, device),
+        alike=torch.arange(num_steps * lanes),
     )
 
 
@@ -924,6 +942,8 @@ def collect(
             if recorder is not None and done[0]:
                 recorder.end_episode()
         _, last_value, _, _ = agent.act(on_device(play.obs, device), play.live)
+    if agent.encoder.pixels and device.type == "cpu":
+        rollout.alike.copy_(first_alike(rollout.obs))
     return last_value, episodes
 
 
@@ -992,14 +1012,17 @@ def minibatch_loss(
     agent: Agent, rollout: Rollout, targets: tuple[Tensor, Tensor], pieces: Pieces, ent_coef: float, args: Args
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the total loss (5.7) of the pieces' steps and the numbers to log; targets: advantages, returns (T, N)."""
-    steps = pieces.steps().to(rollout.values.device)  # (R,)
+    device = rollout.values.device
+    steps = pieces.steps()  # (R,)
+    distinct, which = rollout.alike[steps].unique(return_inverse=True)  # encoded once, however often observed
+    steps, distinct, which = steps.to(device), distinct.to(device), which.to(device)
 
-    def take(stored: Tensor) -> Tensor:
+    def take(stored: Tensor, steps: Tensor = steps) -> Tensor:
         return stored.flatten(0, 1).index_select(0, steps)
 
-    obs = {name: take(part) for name, part in rollout.obs.items()}
-    with autocast(args, steps.device):
-        policy, values, features = agent.unroll(obs, pieces, rollout.memory)
+    obs = {name: take(part, distinct) for name, part in rollout.obs.items()}
+    with autocast(args, device):
+        policy, values, features = agent.unroll(obs, which, pieces, rollout.memory)
     log_ratio = log_probs_of(policy, take(rollout.actions)) - take(rollout.log_probs)  # (R, A)
     entropy = torch.stack([branch.entropy() for branch in policy], -1).sum(-1).mean()
     advantages, returns = map(take, targets)
@@ -1010,8 +1033,8 @@ def minibatch_loss(
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
     logs = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, **policy_numbers(log_ratio, args)}
     if agent.decoder is not None:
-        pixels = next(obs[name] for name in agent.encoder.pixels)
-        with autocast(args, steps.device):
+        pixels = next(obs[name].index_select(0, which) for name in agent.encoder.pixels)
+        with autocast(args, device):
             drawn = agent.decoder(features)
         logs["reconstruction_loss"] = reconstruction_loss(drawn.float(), pixels)
         loss = loss + args.reconstruction_coef * logs["reconstruction_loss"]

@@ -60,7 +60,7 @@ def test_the_losses_are_means_over_real_steps(played, script):
     assert sorted(order.tolist()) == list(range(64))  # every step once, no padding
     obs = {name: part.flatten(0, 1)[order] for name, part in run.rollout.obs.items()}
     with torch.no_grad():
-        features = run.agent.unroll(obs, pieces, run.rollout.memory)[2]
+        features = run.agent.unroll(obs, torch.arange(64), pieces, run.rollout.memory)[2]
         drawn = torch.sigmoid(run.agent.decoder(features))
         wanted = obs["visual_observation"] / 255
         truths = run.rollout.ground_truth.flatten(0, 1)[order]

@@ -33,8 +33,8 @@ def recompute(run):
     rollout = run.rollout
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
     steps = pieces.steps()
-    obs = {name: part.flatten(0, 1)[steps] for name, part in rollout.obs.items()}
-    policy, values, _ = run.agent.unroll(obs, pieces, rollout.memory)
+    obs = {name: part.flatten(0, 1) for name, part in rollout.obs.items()}
+    policy, values, _ = run.agent.unroll(obs, steps, pieces, rollout.memory)
     log_probs = ppo_gru.log_probs_of(policy, rollout.actions.flatten(0, 1)[steps])
     return steps, (log_probs - rollout.log_probs.flatten(0, 1)[steps]).exp(), values
 
@@ -188,6 +188,30 @@ def test_the_encoder_sees_each_step_once_an_epoch_and_no_padding(played, monkeyp
     assert rows == [args.num_envs] * (args.num_steps + 1), "no loop over lanes"
 
 
+@pytest.mark.parametrize("env_id", ["MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"])
+def test_what_was_observed_before_is_encoded_once(played, env_id):
+    """The same gradient as from every step's own observation, whose equals are found in all of its parts."""
+    args, run, *_ = played(env_id=env_id, num_steps=32, reconstruction_coef=0.1)
+    rollout, rows = run.rollout, []
+    obs = [part.flatten(0, 1).flatten(1) for part in rollout.obs.values()]
+    equal = torch.stack([(part[:, None] == part).all(-1) for part in obs]).all(0)  # (R, R)
+    assert torch.equal(rollout.alike, equal.int().argmax(-1))
+    distinct = len(rollout.alike.unique())
+    assert distinct < 0.6 * len(rollout.alike)
+    run.agent.encoder.register_forward_pre_hook(lambda _, inputs: rows.append(len(next(iter(inputs[0].values())))))
+    pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
+    targets, found = 2 * (torch.randn(32, 4),), []
+    for alike in (rollout.alike, torch.arange(len(rollout.alike))):
+        run.agent.zero_grad()
+        loss, _ = ppo_gru.minibatch_loss(
+            run.agent, dataclasses.replace(rollout, alike=alike), targets, pieces, 1e-3, args
+        )
+        loss.backward()
+        found.append((loss.detach(), gradients(run.agent)))
+    assert rows == [distinct, len(rollout.alike)]
+    torch.testing.assert_close(found[0], found[1], atol=1e-6, rtol=1e-4)
+
+
 def test_a_long_episode_takes_no_more_memory_than_a_short_one(played):
     """5,000 steps of endless episodes: the same storage, bytes for pixels, a live memory of the same size."""
     changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"explosion_delay": [1000]}', "hidden_size": 4}
@@ -301,7 +325,7 @@ def test_packed_or_padded_is_the_same(played):
 
 
 def moved(part, device):
-    """A copy on the device of what is on a GPU when there is one: all but the steps' numbers."""
+    """A copy on the device of what is on a GPU when there is one: all but the numbers of steps."""
     if isinstance(part, torch.Tensor):
         return part.to(device)
     if isinstance(part, dict):
@@ -320,7 +344,8 @@ def test_the_update_waits_for_no_device(played, monkeypatch, memory):
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())  # knows no such device
     pieces = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated)
     agent = run.agent.to("meta")
-    rollout = script.Rollout(**{name: moved(part, "meta") for name, part in vars(run.rollout).items()})
+    parts = {name: moved(part, "meta") for name, part in vars(run.rollout).items() if name != "alike"}
+    rollout = script.Rollout(**parts, alike=run.rollout.alike)
     targets = 2 * (torch.zeros(16, 4, device="meta"),)
     for minibatch in pieces.minibatches(2):
         loss, _ = script.minibatch_loss(agent, rollout, targets, minibatch, 0.1, args)
