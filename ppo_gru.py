@@ -38,7 +38,7 @@ import tyro
 from gymnasium.vector import AutoresetMode
 from torch import Tensor, nn
 from torch.distributions import Categorical
-from torch.nn.utils.rnn import PackedSequence, pack_sequence, pad_sequence, unpack_sequence
+from torch.nn.utils.rnn import pad_sequence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
@@ -438,9 +438,12 @@ class Pieces:
 
     def steps(self) -> Tensor:
         """Return the flat indices (R,) of all steps, piece after piece."""
+        return self.first.repeat_interleave(self.length) + self.within() * self.lanes
+
+    def within(self) -> Tensor:
+        """Return which step of its piece, counted from 0, each step (R,) is."""
         start = self.length.cumsum(0) - self.length
-        within = torch.arange(int(self.length.sum())) - start.repeat_interleave(self.length)
-        return self.first.repeat_interleave(self.length) + within * self.lanes
+        return torch.arange(int(self.length.sum())) - start.repeat_interleave(self.length)
 
     def slots(self) -> Tensor:
         """Return where the steps (R,) lie among the S x L places of the pieces, each padded to the longest."""
@@ -579,10 +582,10 @@ class GRUScan(torch.autograd.Function):
     """One layer of `nn.GRU` over packed pieces, for learning on a CPU, where the library's own is much slower.
 
     Takes the projected inputs (R, 3D), the first states (S, D), the recurrent weight and bias, and how many pieces go
-    on at each step, a list; returns the states (R, D). Inputs and states are in a PackedSequence's order: the first
-    step of all pieces, the longest piece first, then the second step of those that have one. What is saved: there is
-    no padding, the weight is turned once instead of at every step, and its gradient is one product of all steps
-    instead of a sum of L small ones. The gates r, z and n are those of torch's documentation of nn.GRU.
+    on at each step, a list; returns the states (R, D). Inputs and states are in the order of torch's PackedSequence:
+    the first step of all pieces, the longest piece first, then the second step of those that have one. What is saved:
+    there is no padding, the weight is turned once instead of at every step, and its gradient is one product of all
+    steps instead of a sum of L small ones. The gates r, z and n are those of torch's documentation of nn.GRU.
     """
 
     @staticmethod
@@ -637,12 +640,11 @@ class GRUScan(torch.autograd.Function):
 class GRU(nn.GRU):
     """`nn.GRU` with the batch first, and a way of its own to learn on a CPU."""
 
-    def scan(self, x: PackedSequence, state: Tensor) -> PackedSequence:
-        """Map packed pieces and the layers' first states (P, S, D), in the packed order, to the last layer's states."""
-        data, sizes = x.data, x.batch_sizes.tolist()
+    def scan(self, x: Tensor, state: Tensor, sizes: list[int]) -> Tensor:
+        """Map packed steps (R, D) and the layers' first states (P, S, D) to the last layer's states (R, D)."""
         for first, (w_input, w_hidden, b_input, b_hidden) in zip(state, self.all_weights, strict=True):
-            data = GRUScan.apply(F.linear(data, w_input, b_input), first, w_hidden, b_hidden, sizes)
-        return x._replace(data=data)
+            x = GRUScan.apply(F.linear(x, w_input, b_input), first, w_hidden, b_hidden, sizes)
+        return x
 
 
 class Memory(nn.Module):
@@ -708,19 +710,20 @@ class Memory(nn.Module):
         if self.kind == "none":
             return x
         live = stored.flatten(0, 1)[pieces.first.to(x.device)]  # (S, P, D)
-        sequences = x.split(pieces.length.tolist())
         if self.packed and x.device.type == "cpu":
-            return self.scan(sequences, live)
-        y, _ = self.recur(pad_sequence(sequences, batch_first=True), live)  # (S, L, D)
+            return self.scan(x, pieces, live)
+        y, _ = self.recur(pad_sequence(x.split(pieces.length.tolist()), batch_first=True), live)  # (S, L, D)
         # The padding ends here: what follows, the losses' means (5.8) included, sees real steps only.
         return y.flatten(0, 1).index_select(0, pieces.slots().to(x.device))
 
-    def scan(self, sequences: tuple[Tensor, ...], live: Tensor) -> Tensor:
-        """Do for pieces what `recur` does for padded ones; return the steps (R, D), piece after piece."""
-        packed = pack_sequence(sequences, enforce_sorted=False)
+    def scan(self, x: Tensor, pieces: Pieces, live: Tensor) -> Tensor:
+        """Do for the steps x (R, D), piece after piece, what `recur` does for padded pieces."""
+        within, longest = pieces.within(), pieces.length.argsort(descending=True)
+        rank = longest.argsort().repeat_interleave(pieces.length)  # (R,) of the step's piece
+        packed = (within * len(longest) + rank).argsort()
         with torch.autocast("cpu", enabled=False):
-            packed = self.rnn.scan(packed, live[packed.sorted_indices].transpose(0, 1))
-        return torch.cat(unpack_sequence(packed))
+            y = self.rnn.scan(x[packed], live[longest].transpose(0, 1), within.bincount().tolist())
+        return y[packed.argsort()]
 
     def recur(self, x: Tensor, live: Tensor) -> tuple[Tensor, Tensor]:
         """Run the recurrent layers over x (S, L, D) from the live memory (S, P, D); return both anew."""

@@ -462,9 +462,12 @@ class Pieces:
 
     def steps(self) -> Tensor:
         """Return the flat indices (R,) of all steps, piece after piece."""
+        return self.first.repeat_interleave(self.length) + self.within() * self.lanes
+
+    def within(self) -> Tensor:
+        """Return which step of its piece, counted from 0, each step (R,) is."""
         start = self.length.cumsum(0) - self.length
-        within = torch.arange(int(self.length.sum())) - start.repeat_interleave(self.length)
-        return self.first.repeat_interleave(self.length) + within * self.lanes
+        return torch.arange(int(self.length.sum())) - start.repeat_interleave(self.length)
 
     def slots(self) -> Tensor:
         """Return where the steps (R,) lie among the S x L places of the pieces, each padded to the longest."""

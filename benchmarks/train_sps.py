@@ -5,8 +5,9 @@
 A bound of an iteration is a part of the encoder and nothing else: forward on every step of the rollout, then forward
 and backward on every step of every epoch, in pieces of the best size. One bound is the three convolutions, the other
 these and the layer from their 3,136 features to the memory's width. A script's iteration is all it does: environments,
-memory, heads, losses and optimizer. All are timed in turn, several times, and the medians divided, because a machine's
-speed changes from minute to minute.
+memory, heads, losses and optimizer. On a CPU it learns from equal pictures at once: `encoded` is how many pictures went
+through the convolutions, of those that the bounds count. All are timed in turn, several times, and the medians divided,
+because a machine's speed changes from minute to minute.
 """
 
 import importlib
@@ -76,8 +77,8 @@ def bound_iteration(network: torch.nn.Module, args, device: torch.device, chunk:
     return iteration
 
 
-def measure(config: Config, num_steps: int) -> tuple[dict[str, float], int]:
-    """Return the steps per second of the script and of both bounds, and the bounds' best piece size."""
+def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, int]:
+    """Return the steps/s of the script and of both bounds, what the script encoded, and the bounds' best piece."""
     script = importlib.import_module(config.script)
     flags = ["--env-id", config.env_id, "--num-envs", str(config.num_envs), "--num-steps"]
     args = tyro.cli(script.Args, args=[*flags, str(num_steps), *config.flags])
@@ -94,28 +95,31 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], int]:
         "encoder": bound_iteration(encoder, args, device, best),
     }
     work["script"]()  # the first iteration allocates
-    times = {name: [] for name in work}
+    times, pictures = {name: [] for name in work}, []
+    run.agent.encoder.cnns[0].register_forward_pre_hook(lambda _, inputs: pictures.append(len(inputs[0])))
     for _ in range(config.rounds):
         for name, iteration in work.items():
             times[name].append(seconds(iteration, device))
     run.envs.close()
     run.writer.close()
-    return {name: config.num_envs * num_steps / statistics.median(taken) for name, taken in times.items()}, best
+    steps = config.num_envs * num_steps
+    encoded = sum(pictures) / (config.rounds * (1 + args.update_epochs) * steps)
+    return {name: steps / statistics.median(taken) for name, taken in times.items()}, encoded, best
 
 
 def main(config: Config) -> None:
     """Print a Markdown table, a row per rollout length."""
     print(f"{config.script} on {config.env_id} {' '.join(config.flags)}, {torch.get_num_threads()} threads\n")
-    print("| lanes x steps | steps/s | convolutions alone | share | encoder alone | share | best piece |")
-    print("|---|---|---|---|---|---|---|")
+    print("| lanes x steps | steps/s | encoded | convolutions alone | share | encoder alone | share | best piece |")
+    print("|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)  # the run folders go there
         for num_steps in config.num_steps:
-            rates, chunk = measure(config, num_steps)
+            rates, encoded, chunk = measure(config, num_steps)
             bounds = [
                 f"{rates[name]:.0f} | {rates['script'] / rates[name]:.2f}" for name in ("convolutions", "encoder")
             ]
-            row = [f"{config.num_envs} x {num_steps}", f"{rates['script']:.0f}", *bounds, str(chunk)]
+            row = [f"{config.num_envs} x {num_steps}", f"{rates['script']:.0f}", f"{encoded:.2f}", *bounds, str(chunk)]
             print(f"| {' | '.join(row)} |", flush=True)
 
 

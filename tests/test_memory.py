@@ -179,7 +179,7 @@ def test_the_encoder_sees_each_step_once_an_epoch_and_no_padding(played, monkeyp
     run.agent.encoder.register_forward_pre_hook(lambda _, inputs: rows.append(len(inputs[0]["observation"])))
     for way in ("recur", "scan"):
         unroll = getattr(run.agent.memory, way)
-        monkeypatch.setattr(run.agent.memory, way, lambda x, live, unroll=unroll: (runs.append(1), unroll(x, live))[1])
+        monkeypatch.setattr(run.agent.memory, way, lambda *given, unroll=unroll: (runs.append(1), unroll(*given))[1])
     ppo_gru.update(run.agent, run.optimizer, run.rollout, last_value, 0.0, args)
     assert sum(rows) == args.update_epochs * args.num_envs * args.num_steps
     assert len(runs) == args.update_epochs * args.num_minibatches, "all pieces of a minibatch at once"
@@ -306,7 +306,8 @@ def test_the_gru_learns_as_the_library_s(layers):
         )
         packed = nn.utils.rnn.pack_sequence(pieces, enforce_sorted=False)
         if gru is ours:  # whose states are in the packed order
-            y = gru.scan(packed, state[:, packed.sorted_indices])
+            y = gru.scan(packed.data, state[:, packed.sorted_indices], packed.batch_sizes.tolist())
+            y = packed._replace(data=y)
         else:
             y, _ = gru(packed, state)
         y = torch.cat(nn.utils.rnn.unpack_sequence(y))
