@@ -151,6 +151,7 @@ def tasks_of(runs: dict[str, dict[str, Any]], title: Callable) -> dict[str, dict
     """Sort runs, arguments by path, into tasks and agents: the paths of an agent's seeds by title and label."""
     tasks = defaultdict(dict)
     for path, args in runs.items():
+        args = args | {"env_options": json.dumps(json.loads(args["env_options"]), sort_keys=True)}  # one spelling
         tasks[title(args)][path] = args
     return {name: agents_of(members) for name, members in tasks.items()}
 

@@ -320,14 +320,14 @@ def require(module: str, name: str, extra: str):
 class LaneRecorder:
     """Writes videos of lane 0, of the episodes that Gymnasium's capped cubic schedule picks (0, 1, 8, 27, ...).
 
-    A video shows every observation that was acted on, up to max_frames. Raises ImportError without the extra `play`,
-    ValueError if the environment draws no pictures.
+    A video shows every observation that was acted on, up to max_frames, of which it is written at once: the episode may
+    be endless. Raises ImportError without the extra `play`, ValueError if the environment draws no pictures.
     """
 
     def __init__(self, envs: gym.vector.VectorEnv, folder: str, max_frames: int = 1000):
         self.envs, self.folder, self.max_frames = envs, folder, max_frames
         self.episode, self.frames = 0, []
-        self.write = require("moviepy.video.io.ImageSequenceClip", "--capture-video", "play").ImageSequenceClip
+        self.clip = require("moviepy.video.io.ImageSequenceClip", "--capture-video", "play").ImageSequenceClip
         # Gymnasium's module imports moviepy as well, so it must not be imported without the extra.
         self.is_due = importlib.import_module("gymnasium.utils.save_video").capped_cubic_video_schedule
         if not isinstance((envs.render() or [None])[0], np.ndarray):
@@ -337,14 +337,20 @@ class LaneRecorder:
         """Keep a frame of the episode that is being played, if it is one to record."""
         if self.is_due(self.episode) and len(self.frames) < self.max_frames:
             self.frames.append(self.envs.render()[0])
+            if len(self.frames) == self.max_frames:
+                self.write()
 
     def end_episode(self) -> None:
-        """Write the episode's frames to episode-<number>.mp4 and go on to the next episode."""
-        if self.frames:
-            os.makedirs(self.folder, exist_ok=True)
-            clip = self.write(self.frames, fps=self.envs.metadata.get("render_fps", 30))
-            clip.write_videofile(os.path.join(self.folder, f"episode-{self.episode}.mp4"), logger=None)
+        """Write the episode's video, unless that is done, and go on to the next episode."""
+        if 0 < len(self.frames) < self.max_frames:
+            self.write()
         self.episode, self.frames = self.episode + 1, []
+
+    def write(self) -> None:
+        """Write the frames to episode-<number>.mp4."""
+        os.makedirs(self.folder, exist_ok=True)
+        clip = self.clip(self.frames, fps=self.envs.metadata.get("render_fps", 30))
+        clip.write_videofile(os.path.join(self.folder, f"episode-{self.episode}.mp4"), logger=None)
 
 
 # ---- 3 PURE FUNCTIONS ----
@@ -1285,6 +1291,8 @@ def train(args: Args, run: Run) -> str:
     finally:
         if args.save_model:
             save_model(run.agent, args, os.path.join(run.folder, "model.pt"))
+        if run.recorder is not None:
+            run.recorder.end_episode()
         run.writer.close()
         for envs in filter(None, (run.envs, run.eval_envs)):
             envs.close()

@@ -110,10 +110,11 @@ def test_the_same_seed_twice_is_refused():
 
 def test_other_tasks_are_apart():
     other = arguments(env_options='{"show_goal": [true]}')
-    tasks = evaluate.tasks_of({"a": arguments(), "b": other, "c": arguments(seed=2)}, evaluate.task_of)
-    assert tasks == {
+    spelled = arguments(env_options='{ "show_goal":[true] }', seed=2)
+    runs = {"a": arguments(), "b": other, "c": arguments(seed=2), "d": spelled}
+    assert evaluate.tasks_of(runs, evaluate.task_of) == {
         "MysteryPath-v0": {"ppo_gru": ["a", "c"]},
-        'MysteryPath-v0 {"show_goal": [true]}': {"ppo_gru": ["b"]},
+        'MysteryPath-v0 {"show_goal": [true]}': {"ppo_gru": ["b", "d"]},
     }
 
 

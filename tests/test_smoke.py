@@ -248,6 +248,22 @@ def test_capture_video(tiny):
     assert all(os.path.getsize(video) > 1000 for video in videos)
 
 
+def test_an_endless_episode_has_a_video_too(tiny, tmp_path):
+    pytest.importorskip("moviepy")
+    endless = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"explosion_delay": [1000]}'}
+    folder = ppo_gru.main(tiny(capture_video=True, **endless))
+    assert os.listdir(os.path.join(folder, "videos")) == ["episode-0.mp4"], "written when the training ends"
+    envs = ppo_gru.make_envs(tiny(**endless), 1, "debug_rgb_array")
+    envs.reset(seed=1)
+    recorder = ppo_gru.LaneRecorder(envs, str(tmp_path / "cut"), max_frames=3)
+    for frames in range(1, 5):
+        recorder.capture()
+        assert (tmp_path / "cut" / "episode-0.mp4").exists() == (frames >= 3), "written when it is long enough"
+    (tmp_path / "cut" / "episode-0.mp4").unlink()
+    recorder.end_episode()
+    assert not os.listdir(tmp_path / "cut"), "written once"
+
+
 @pytest.mark.parametrize(("script", "width"), [(ppo_gru, "--hidden-size"), (ppo_trxl, "--trxl-dim")])
 def test_command_line(tmp_path, script, width):
     flags = "--env-id MortarMayhem-Grid-v0 --total-timesteps 128 --num-envs 2 --num-steps 64 --num-minibatches 2"
