@@ -93,6 +93,8 @@ class Args:
     """observe the last so many pictures at once, in grayscale, or so many vectors (0: only the present, in colour)"""
     step_encoding: bool = False
     """observe the number of the episode's step too, as a sinusoidal encoding of width 16"""
+    vector_frequencies: int = 0
+    """give the network the sines and cosines of a vector's numbers too, at so many frequencies (0: none)"""
 
     total_timesteps: int = 163_840_000
     """steps to train for, all lanes together, rounded down to whole iterations of num_envs x num_steps"""
@@ -182,7 +184,7 @@ def flag(name: str) -> str:
 def check_args(args: Args) -> None:
     """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work."""
     integers = [(name, 0) for name in ("num_levels", "start_level", "anneal_steps", "seed")]
-    integers += [(name, 0) for name in ("frame_stack", "eval_interval")]
+    integers += [(name, 0) for name in ("frame_stack", "vector_frequencies", "eval_interval")]
     integers += [(name, 1) for name in ("num_envs", "num_steps", "num_minibatches", "update_epochs")]
     integers += [(name, 1) for name in ("head_size", "eval_levels", "eval_repeats", "eval_max_steps")]
     integers += [(name, 1) for name in ("total_timesteps", "trxl_num_layers", "trxl_num_heads", "trxl_dim")]
@@ -200,6 +202,10 @@ def check_args(args: Args) -> None:
         value = getattr(args, name)
         if value is not None and not value > 0:
             raise ValueError(f"{flag(name)} is {value}; it must be above 0")
+    if args.vector_frequencies > 16:
+        raise ValueError(
+            f"--vector-frequencies is {args.vector_frequencies}; it must be at most 16, each twice the last"
+        )
     if not args.exp_name or set(args.exp_name) & set("/\\"):
         raise ValueError(f"--exp-name is {args.exp_name!r}; it must be a name without slashes")
     batch_size = args.num_envs * args.num_steps
@@ -385,6 +391,15 @@ def layer_init(layer: nn.Module, gain: float = math.sqrt(2)) -> nn.Module:
     return layer
 
 
+def with_frequencies(x: Tensor, frequencies: int) -> Tensor:
+    """Append to numbers (B, V) their Fourier features, sines and cosines at pi, 2 pi, 4 pi ...: (B, V (1 + 2 K)).
+
+    What differs little in x differs much in these, so that a network tells it apart sooner (Tancik et al., 2020).
+    """
+    angles = x[..., None] * (math.pi * 2 ** torch.arange(frequencies, device=x.device))  # (B, V, K)
+    return torch.cat([x, angles.sin().flatten(1), angles.cos().flatten(1)], -1)
+
+
 def anneal(step: int, initial: float, final: float, anneal_steps: int) -> float:
     """Decay linearly from initial to final over anneal_steps, then stay; without anneal_steps stay at initial."""
     fraction = min(step / anneal_steps, 1.0) if anneal_steps else 0.0
@@ -526,10 +541,14 @@ class AtariCNN(nn.Sequential):
 
 
 class Encoder(nn.Module):
-    """Encodes each part of an observation, concatenates the features and embeds them in the memory's width (5.1)."""
+    """Encodes each part of an observation, concatenates the features and embeds them in the memory's width (5.1).
 
-    def __init__(self, spaces: dict[str, gym.spaces.Box], width: int):
+    Raises ValueError for frequencies without a vector to take them of.
+    """
+
+    def __init__(self, spaces: dict[str, gym.spaces.Box], width: int, frequencies: int):
         super().__init__()
+        self.frequencies = frequencies
         self.pixels = [name for name, space in spaces.items() if len(space.shape) == 3]
         self.vectors = [name for name, space in spaces.items() if len(space.shape) == 1]
         self.cnns = nn.ModuleList(AtariCNN(spaces[name].shape[2]) for name in self.pixels)
@@ -537,15 +556,19 @@ class Encoder(nn.Module):
             blank = [torch.zeros(1, *spaces[name].shape) for name in self.pixels]
             features = sum(cnn(x).shape[1] for cnn, x in zip(self.cnns, blank, strict=True))
         if self.vectors:
-            self.mlp = layer_init(nn.Linear(sum(spaces[name].shape[0] for name in self.vectors), 128))
+            numbers = sum(spaces[name].shape[0] for name in self.vectors)
+            self.mlp = layer_init(nn.Linear(numbers * (1 + 2 * frequencies), 128))
             features += 128
+        elif frequencies:
+            raise ValueError("--vector-frequencies needs an observation with a vector; use 0")
         self.embedding = layer_init(nn.Linear(features, width))
 
     def forward(self, obs: dict[str, Tensor]) -> Tensor:
         """Encode observations of B steps, each part (B, ...), to (B, D)."""
         features = [cnn(obs[name]) for cnn, name in zip(self.cnns, self.pixels, strict=True)]
         if self.vectors:
-            features.append(F.relu(self.mlp(torch.cat([obs[name].float() for name in self.vectors], -1))))
+            vector = torch.cat([obs[name].float() for name in self.vectors], -1)
+            features.append(F.relu(self.mlp(with_frequencies(vector, self.frequencies))))
         features = torch.cat(features, -1) if len(features) > 1 else features[0]
         return F.relu(self.embedding(features)).float()
 
@@ -923,7 +946,7 @@ class Agent(nn.Module):
         super().__init__()
         spaces = observation_spaces(observation_space)
         self.memory = Memory(args)
-        self.encoder = Encoder(spaces, self.memory.width)
+        self.encoder = Encoder(spaces, self.memory.width, args.vector_frequencies)
         self.heads = Heads(self.memory.width, action_branches(action_space), args.head_size)
         with torch.random.fork_rng([]):  # what follows from the seed is the same with and without these
             self.decoder = Decoder(args.head_size, spaces) if args.reconstruction_coef else None
@@ -1020,7 +1043,8 @@ def load_weights(agent: Agent, path: str) -> None:
         if not all(name.startswith(("decoder.", "estimator.")) for name in (*missing, *unexpected)):
             raise RuntimeError
     except (RuntimeError, TypeError):
-        shaping = ("env_id", *agent.memory.flags, "head_size", "obs_type", "frame_stack", "step_encoding")
+        shaping = ("env_id", *agent.memory.flags, "head_size", "obs_type")
+        shaping += ("frame_stack", "step_encoding", "vector_frequencies")
         flags = [f"{flag(name)} {getattr(saved_args, name)}" for name in shaping]
         raise ValueError(f"{path} holds the weights of another network, trained with {' '.join(flags)}") from None
 

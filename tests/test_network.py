@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+import ppo_gru
 import ppo_trxl
 from ppo_gru import Agent, Args, AtariCNN, action_branches, observation_spaces, to_env_actions
 
@@ -31,6 +32,16 @@ def test_sizes_of_table_6_2():
     agent = Agent(both, gym.spaces.Discrete(4), Args())
     assert (agent.encoder.mlp.in_features, agent.encoder.mlp.out_features) == (180, 128)
     assert agent.encoder.embedding.in_features == 3264
+
+
+def test_fourier_features_of_a_vector():
+    x, root = torch.tensor([[0.25, 1.0]]), 0.5**0.5
+    wanted = torch.tensor([[0.25, 1.0, root, 1.0, 0.0, 0.0, root, 0.0, -1.0, 1.0]])
+    torch.testing.assert_close(ppo_gru.with_frequencies(x, 2), wanted, atol=1e-6, rtol=0)
+    assert ppo_gru.with_frequencies(x, 0).equal(x)
+    vector = gym.spaces.Box(0, 1, (16,), np.float32)
+    agent = Agent(vector, gym.spaces.Discrete(4), Args(vector_frequencies=4))
+    assert agent.encoder.mlp.in_features == 144
 
 
 def test_defaults_are_the_final_column_of_table_6_1():
