@@ -45,6 +45,7 @@ class Task:
     metric: str  # the family's own (6.1.3)
     total_timesteps: int
     flags: str
+    trxl: str = ""  # the transformer's own
 
 
 TASKS = {
@@ -69,7 +70,11 @@ TASKS = {
         {"cardinal_origin_choice": [0], "reward_path_progress": 0.1},
         "success",
         3_000_000,
-        "--num-envs 32 --init-lr 7e-4 --final-lr 1e-4 --init-ent-coef 0.003 --final-ent-coef 0.0001",
+        # To remember tiles, an agent has to tell them apart; their coordinates alone differ by a seventh.
+        "--num-envs 32 --init-lr 7e-4 --final-lr 1e-4 --init-ent-coef 0.003 --final-ent-coef 0.0001 "
+        "--vector-frequencies 4",
+        # Where the agent fell matters, not when.
+        "--trxl-positional-encoding none",
     ),
 }
 
@@ -97,7 +102,7 @@ class Config:
 def command(task: Task, agent: str, seed: int, evaluations: int) -> list[str]:
     """Return the command line of a training run."""
     script, *memory = AGENTS[agent].split()
-    flags = [*memory, *COMMON.split(), *task.flags.split()]
+    flags = [*memory, *COMMON.split(), *task.flags.split(), *(task.trxl.split() if "trxl" in script else [])]
     lanes = int(flags[flags.index("--num-envs") + 1])
     iterations = task.total_timesteps // (lanes * int(flags[flags.index("--num-steps") + 1]))
     every = str(max(1, iterations // evaluations))
