@@ -90,7 +90,7 @@ class Args:
     step_encoding: bool = False
     """observe the number of the episode's step too, as a sinusoidal encoding of width 16"""
     vector_frequencies: int = 0
-    """give the network the sines and cosines of a vector's numbers too, at so many frequencies (0: none)"""
+    """give the network sines and cosines of a vector's numbers, from 0 to 1, too, at so many frequencies (0: none)"""
 
     total_timesteps: int = 163_840_000
     """steps to train for, all lanes together, rounded down to whole iterations of num_envs x num_steps"""
@@ -166,11 +166,11 @@ def flag(name: str) -> str:
 def check_args(args: Args) -> None:
     """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work."""
     integers = [(name, 0) for name in ("num_levels", "start_level", "anneal_steps", "seed")]
-    integers += [(name, 0) for name in ("frame_stack", "vector_frequencies", "eval_interval", "seq_len")]
+    integers += [(name, 0) for name in ("frame_stack", "eval_interval", "seq_len")]
     integers += [(name, 1) for name in ("num_envs", "num_steps", "num_minibatches", "update_epochs")]
     integers += [(name, 1) for name in ("head_size", "eval_levels", "eval_repeats", "eval_max_steps")]
     integers += [(name, 1) for name in ("total_timesteps", "hidden_size", "num_layers")]
-    numbers = [("gamma", 0, 1), ("gae_lambda", 0, 1)]
+    numbers = [("gamma", 0, 1), ("gae_lambda", 0, 1), ("vector_frequencies", 0, 16)]
     numbers += [(name, 0, math.inf) for name in ("vf_coef", "init_lr", "final_lr", "init_ent_coef", "final_ent_coef")]
     numbers += [(name, 0, math.inf) for name in ("reconstruction_coef", "ground_truth_coef")]
     for name, low in integers:
@@ -183,10 +183,6 @@ def check_args(args: Args) -> None:
         value = getattr(args, name)
         if value is not None and not value > 0:
             raise ValueError(f"{flag(name)} is {value}; it must be above 0")
-    if args.vector_frequencies > 16:
-        raise ValueError(
-            f"--vector-frequencies is {args.vector_frequencies}; it must be at most 16, each twice the last"
-        )
     if not args.exp_name or set(args.exp_name) & set("/\\"):
         raise ValueError(f"--exp-name is {args.exp_name!r}; it must be a name without slashes")
     batch_size = args.num_envs * args.num_steps
@@ -326,13 +322,13 @@ def require(module: str, name: str, extra: str):
 class LaneRecorder:
     """Writes videos of lane 0, of the episodes that Gymnasium's capped cubic schedule picks (0, 1, 8, 27, ...).
 
-    A video shows every observation that was acted on, up to max_frames, of which it is written at once: the episode may
-    be endless. Raises ImportError without the extra `play`, ValueError if the environment draws no pictures.
+    A video shows every observation that was acted on. It is written when the episode ends or max_frames are reached.
+    Raises ImportError without the extra `play`, ValueError if the environment draws no pictures.
     """
 
     def __init__(self, envs: gym.vector.VectorEnv, folder: str, max_frames: int = 1000):
         self.envs, self.folder, self.max_frames = envs, folder, max_frames
-        self.episode, self.frames = 0, []
+        self.episode, self.frames, self.written = 0, [], False
         self.clip = require("moviepy.video.io.ImageSequenceClip", "--capture-video", "play").ImageSequenceClip
         # Gymnasium's module imports moviepy as well, so it must not be imported without the extra.
         self.is_due = importlib.import_module("gymnasium.utils.save_video").capped_cubic_video_schedule
@@ -341,22 +337,23 @@ class LaneRecorder:
 
     def capture(self) -> None:
         """Keep a frame of the episode that is being played, if it is one to record."""
-        if self.is_due(self.episode) and len(self.frames) < self.max_frames:
+        if self.is_due(self.episode) and not self.written:
             self.frames.append(self.envs.render()[0])
             if len(self.frames) == self.max_frames:
                 self.write()
 
     def end_episode(self) -> None:
         """Write the episode's video, unless that is done, and go on to the next episode."""
-        if 0 < len(self.frames) < self.max_frames:
+        if self.frames:
             self.write()
-        self.episode, self.frames = self.episode + 1, []
+        self.episode, self.written = self.episode + 1, False
 
     def write(self) -> None:
-        """Write the frames to episode-<number>.mp4."""
+        """Write the frames to episode-<number>.mp4 and let go of them."""
         os.makedirs(self.folder, exist_ok=True)
         clip = self.clip(self.frames, fps=self.envs.metadata.get("render_fps", 30))
         clip.write_videofile(os.path.join(self.folder, f"episode-{self.episode}.mp4"), logger=None)
+        self.frames, self.written = [], True
 
 
 # ---- 3 PURE FUNCTIONS ----
@@ -670,7 +667,10 @@ class GRU(nn.GRU):
     """`nn.GRU` with the batch first, and a way of its own to learn on a CPU."""
 
     def scan(self, x: Tensor, state: Tensor, sizes: list[int]) -> Tensor:
-        """Map packed steps (R, D) and the layers' first states (P, S, D) to the last layer's states (R, D)."""
+        """Map steps (R, D) and the layers' first states (P, S, D) to the last layer's states (R, D).
+
+        All in the order that GRUScan takes them in, as it takes the sizes.
+        """
         for first, (w_input, w_hidden, b_input, b_hidden) in zip(state, self.all_weights, strict=True):
             x = GRUScan.apply(F.linear(x, w_input, b_input), first, w_hidden, b_hidden, sizes)
         return x
@@ -749,10 +749,10 @@ class Memory(nn.Module):
         """Do for the steps x (R, D), piece after piece, what `recur` does for padded pieces."""
         within, longest = pieces.within(), pieces.length.argsort(descending=True)
         rank = longest.argsort().repeat_interleave(pieces.length)  # (R,) of the step's piece
-        packed = (within * len(longest) + rank).argsort()
+        order = (within * len(longest) + rank).argsort()
         with torch.autocast("cpu", enabled=False):
-            y = self.rnn.scan(x[packed], live[longest].transpose(0, 1), within.bincount().tolist())
-        return y[packed.argsort()]
+            y = self.rnn.scan(x[order], live[longest].transpose(0, 1), within.bincount().tolist())
+        return y[order.argsort()]
 
     def recur(self, x: Tensor, live: Tensor) -> tuple[Tensor, Tensor]:
         """Run the recurrent layers over x (S, L, D) from the live memory (S, P, D); return both anew."""
@@ -773,7 +773,7 @@ class Agent(nn.Module):
     """Encoder, memory and heads. Plays step by step with `act`, learns from whole pieces with `unroll`.
 
     ground_truths is how many numbers the environment's ground truth has. Raises ValueError for spaces that it cannot
-    encode, act in or draw.
+    encode as the arguments ask, act in or draw.
     """
 
     def __init__(self, observation_space: gym.Space, action_space: gym.Space, args: Args, ground_truths: int = 0):
@@ -975,7 +975,7 @@ def collect(
             if recorder is not None and done[0]:
                 recorder.end_episode()
         _, last_value, _, _ = agent.act(on_device(play.obs, device), play.live)
-    if agent.encoder.pixels and device.type == "cpu":
+    if agent.encoder.pixels and device.type == "cpu":  # elsewhere, encoding costs less than to look for equals
         rollout.alike.copy_(first_alike(rollout.obs))
     return last_value, episodes
 
@@ -1047,11 +1047,11 @@ def minibatch_loss(
     """Return the total loss (5.7) of the pieces' steps and the numbers to log; targets: advantages, returns (T, N)."""
     device = rollout.values.device
     steps = pieces.steps()  # (R,)
-    distinct, which = rollout.alike[steps].unique(return_inverse=True)  # encoded once, however often observed
+    distinct, which = rollout.alike[steps].unique(return_inverse=True)  # equals are encoded once
     steps, distinct, which = steps.to(device), distinct.to(device), which.to(device)
 
-    def take(stored: Tensor, steps: Tensor = steps) -> Tensor:
-        return stored.flatten(0, 1).index_select(0, steps)
+    def take(stored: Tensor, rows: Tensor = steps) -> Tensor:
+        return stored.flatten(0, 1).index_select(0, rows)
 
     obs = {name: take(part, distinct) for name, part in rollout.obs.items()}
     with autocast(args, device):
@@ -1066,7 +1066,7 @@ def minibatch_loss(
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
     logs = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, **policy_numbers(log_ratio, args)}
     if agent.decoder is not None:
-        pixels = next(obs[name].index_select(0, which) for name in agent.encoder.pixels)
+        pixels = obs[agent.encoder.pixels[0]].index_select(0, which)
         with autocast(args, device):
             drawn = agent.decoder(features)
         logs["reconstruction_loss"] = reconstruction_loss(drawn.float(), pixels)
@@ -1315,11 +1315,11 @@ def train(args: Args, run: Run) -> str:
     finally:
         if args.save_model:
             save_model(run.agent, args, os.path.join(run.folder, "model.pt"))
-        if run.recorder is not None:
-            run.recorder.end_episode()
         run.writer.close()
         for envs in filter(None, (run.envs, run.eval_envs)):
             envs.close()
+        if run.recorder is not None:
+            run.recorder.end_episode()
     return run.folder
 
 

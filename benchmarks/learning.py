@@ -8,13 +8,14 @@ stack the last four of them. Scores are those of evaluations during training, on
 """
 
 import glob
+import importlib
 import json
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ class Task:
     metric: str  # the family's own (6.1.3)
     total_timesteps: int
     flags: str
-    trxl: str = ""  # the transformer's own
+    trxl_flags: str = ""  # the transformer's own
 
 
 TASKS = {
@@ -102,7 +103,7 @@ class Config:
 def command(task: Task, agent: str, seed: int, evaluations: int) -> list[str]:
     """Return the command line of a training run."""
     script, *memory = AGENTS[agent].split()
-    flags = [*memory, *COMMON.split(), *task.flags.split(), *(task.trxl.split() if "trxl" in script else [])]
+    flags = [*memory, *COMMON.split(), *task.flags.split(), *(task.trxl_flags.split() if "trxl" in script else [])]
     lanes = int(flags[flags.index("--num-envs") + 1])
     iterations = task.total_timesteps // (lanes * int(flags[flags.index("--num-steps") + 1]))
     every = str(max(1, iterations // evaluations))
@@ -113,14 +114,23 @@ def command(task: Task, agent: str, seed: int, evaluations: int) -> list[str]:
 
 
 def folder_of(config: Config, task: Task, agent: str, seed: int) -> str | None:
-    """Return the folder of a run that came to its end, if there is one: it was evaluated then."""
+    """Return the folder of such a run that came to its end, if there is one: it was evaluated then."""
+    wanted = arguments(command(task, agent, seed, config.evaluations))
     for folder in sorted(glob.glob(f"{config.folder}/runs/{task.env_id}__{agent.replace(' ', '-')}__{seed}__*")):
         run = EventAccumulator(folder, size_guidance={"scalars": 0})
         run.Reload()
-        evaluated = run.Tags()["scalars"] and f"eval/{task.metric}" in run.Tags()["scalars"]
-        if evaluated and run.Scalars(f"eval/{task.metric}")[-1].step > 0.99 * task.total_timesteps:
+        if f"eval/{task.metric}" not in run.Tags()["scalars"] or evaluate.hyperparameters(run) != wanted:
+            continue
+        if run.Scalars(f"eval/{task.metric}")[-1].step > 0.99 * task.total_timesteps:
             return folder
     return None
+
+
+def arguments(line: list[str]) -> dict[str, str]:
+    """Return a command line's arguments as `evaluate.hyperparameters` tells those of a run."""
+    script = importlib.import_module(Path(line[1]).stem)
+    args = asdict(tyro.cli(script.Args, args=line[2:]))
+    return {"script": script.__name__} | {name: " ".join(str(value).split()) for name, value in args.items()}
 
 
 def train(config: Config, task: Task, agent: str, seed: int) -> None:

@@ -5,9 +5,11 @@
 A bound of an iteration is a part of the encoder and nothing else: forward on every step of the rollout, then forward
 and backward on every step of every epoch, in pieces of the best size. One bound is the three convolutions, the other
 these and the layer from their 3,136 features to the memory's width. A script's iteration is all it does: environments,
-memory, heads, losses and optimizer. On a CPU it learns from equal pictures at once: `encoded` is how many pictures went
-through the convolutions, of those that the bounds count. All are timed in turn, several times, and the medians divided,
-because a machine's speed changes from minute to minute.
+memory, heads, losses and optimizer. All are timed in turn, several times, and the medians divided, because a machine's
+speed changes from minute to minute.
+
+On a CPU, a script encodes equal observations of a minibatch once, and may overtake a bound where there are many:
+`distinct` is the share of an update's observations that it encodes, under a policy that has learned next to nothing.
 """
 
 import importlib
@@ -78,7 +80,7 @@ def bound_iteration(network: torch.nn.Module, args, device: torch.device, chunk:
 
 
 def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, int]:
-    """Return the steps/s of the script and of both bounds, what the script encoded, and the bounds' best piece."""
+    """Return the steps/s of the script and of both bounds, the share of distinct pictures, and the best piece."""
     script = importlib.import_module(config.script)
     flags = ["--env-id", config.env_id, "--num-envs", str(config.num_envs), "--num-steps"]
     args = tyro.cli(script.Args, args=[*flags, str(num_steps), *config.flags])
@@ -95,31 +97,32 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, in
         "encoder": bound_iteration(encoder, args, device, best),
     }
     work["script"]()  # the first iteration allocates
-    times, pictures = {name: [] for name in work}, []
-    run.agent.encoder.cnns[0].register_forward_pre_hook(lambda _, inputs: pictures.append(len(inputs[0])))
+    times, encoded = {name: [] for name in work}, []
+    cnn = run.agent.encoder.cnns[0]
+    cnn.register_forward_pre_hook(lambda _, inputs: encoded.append(len(inputs[0]) * torch.is_grad_enabled()))
     for _ in range(config.rounds):
         for name, iteration in work.items():
             times[name].append(seconds(iteration, device))
     run.envs.close()
     run.writer.close()
     steps = config.num_envs * num_steps
-    encoded = sum(pictures) / (config.rounds * (1 + args.update_epochs) * steps)
-    return {name: steps / statistics.median(taken) for name, taken in times.items()}, encoded, best
+    distinct = sum(encoded) / (config.rounds * args.update_epochs * steps)
+    return {name: steps / statistics.median(taken) for name, taken in times.items()}, distinct, best
 
 
 def main(config: Config) -> None:
     """Print a Markdown table, a row per rollout length."""
     print(f"{config.script} on {config.env_id} {' '.join(config.flags)}, {torch.get_num_threads()} threads\n")
-    print("| lanes x steps | steps/s | encoded | convolutions alone | share | encoder alone | share | best piece |")
+    print("| lanes x steps | steps/s | distinct | convolutions alone | share | encoder alone | share | best piece |")
     print("|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)  # the run folders go there
         for num_steps in config.num_steps:
-            rates, encoded, chunk = measure(config, num_steps)
+            rates, distinct, chunk = measure(config, num_steps)
             bounds = [
                 f"{rates[name]:.0f} | {rates['script'] / rates[name]:.2f}" for name in ("convolutions", "encoder")
             ]
-            row = [f"{config.num_envs} x {num_steps}", f"{rates['script']:.0f}", f"{encoded:.2f}", *bounds, str(chunk)]
+            row = [f"{config.num_envs} x {num_steps}", f"{rates['script']:.0f}", f"{distinct:.2f}", *bounds, str(chunk)]
             print(f"| {' | '.join(row)} |", flush=True)
 
 

@@ -25,7 +25,7 @@ CASES = {
     '--env-id CartPole-v1 --env-options {"a":1}': "CartPole-v1 has none",
     "--num-envs 0": "--num-envs is 0; it must be 1 or more",
     "--vector-frequencies 4": "--vector-frequencies needs an observation with a vector; use 0",
-    "--vector-frequencies 17": "--vector-frequencies is 17; it must be at most 16",
+    "--vector-frequencies 17": "--vector-frequencies is 17; it must be a number from 0 to 16",
     "--gamma 1.5": "--gamma is 1.5; it must be a number from 0 to 1",
     "--init-lr nan": "--init-lr is nan",
     "--clip-coef 0": "--clip-coef is 0.0; it must be above 0",

@@ -33,8 +33,9 @@ def recompute(run):
     rollout = run.rollout
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
     steps = pieces.steps()
-    obs = {name: part.flatten(0, 1) for name, part in rollout.obs.items()}
-    policy, values, _ = run.agent.unroll(obs, steps, pieces, rollout.memory)
+    distinct, which = rollout.alike[steps].unique(return_inverse=True)
+    obs = {name: part.flatten(0, 1)[distinct] for name, part in rollout.obs.items()}
+    policy, values, _ = run.agent.unroll(obs, which, pieces, rollout.memory)
     log_probs = ppo_gru.log_probs_of(policy, rollout.actions.flatten(0, 1)[steps])
     return steps, (log_probs - rollout.log_probs.flatten(0, 1)[steps]).exp(), values
 

@@ -69,6 +69,21 @@ def test_trains(tiny, scalars, env_id, memory):
         assert curves.keys() >= EPISODES
 
 
+def test_trains_on_vectors_and_their_frequencies(tiny, scalars, monkeypatch):
+    """The network takes the Fourier features, and a model that is older than the flag is one without them."""
+    vectors = {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "vector_frequencies": 4, "save_model": True}
+    taken, append = [], ppo_gru.with_frequencies
+    monkeypatch.setattr(ppo_gru, "with_frequencies", lambda *given: taken.append(append(*given)) or taken[-1])
+    folder = ppo_gru.main(tiny(**vectors))
+    assert {part.shape[1] for part in taken} == {16 * 9}
+    assert all(error < 1e-5 for error in scalars(folder)["losses/ratio_error"])
+    path = os.path.join(folder, "model.pt")
+    saved = torch.load(path, weights_only=True)
+    del saved["args"]["vector_frequencies"]
+    torch.save(saved, path)
+    assert ppo_gru.load_model(path)[0].vector_frequencies == 0
+
+
 def test_logs_every_number_of_the_final_info(tiny, scalars):
     options = '{"command_count": [2], "explosion_delay": [3], "explosion_duration": [1]}'
     curves = scalars(ppo_gru.main(tiny(env_id="MortarMayhemB-Grid-v0", env_options=options)))
