@@ -28,6 +28,7 @@ import numpy as np
 import torch
 import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.util.tensor_util import make_ndarray
 from tqdm import tqdm
 
 import ppo_gru
@@ -189,7 +190,7 @@ def read_run(folder: str) -> EventAccumulator:
     """Read a run folder's TensorBoard file; raise ValueError if there is none or it holds no curves."""
     if not os.path.isdir(folder):
         raise ValueError(f"there is no run folder {folder}")
-    events = EventAccumulator(folder, size_guidance={"scalars": 0})
+    events = EventAccumulator(folder, size_guidance={"scalars": 0, "tensors": 0})
     events.Reload()
     tags = events.Tags()
     if not tags["scalars"] or "hyperparameters/text_summary" not in tags["tensors"]:
@@ -222,40 +223,52 @@ def curve_name(metric: str, runs: list[EventAccumulator]) -> str:
 
 
 def read_curve(run: EventAccumulator, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the steps and values of a scalar, without those that are no number; raise ValueError if none is."""
-    points = [(point.step, point.value) for point in run.Scalars(name) if np.isfinite(point.value)]
+    """Return the steps (P,) and values (P, M) of a curve: of each level where the evaluations kept them, else M = 1.
+
+    Raises ValueError if a scalar is nowhere a number; where it is none, there is no point.
+    """
+    levels = name.replace("eval/", "eval_levels/")
+    if levels != name and levels in run.Tags()["tensors"]:
+        points = [(point.step, make_ndarray(point.tensor_proto)) for point in run.Tensors(levels)]
+    else:
+        points = [(point.step, [point.value]) for point in run.Scalars(name) if np.isfinite(point.value)]
     if not points:
         raise ValueError(f"{run.path} has no number in its curve of {name}")
-    steps, values = np.array(points).T
-    return steps, values
+    steps, values = zip(*points, strict=True)
+    return np.array(steps), np.array(values)
 
 
 def align(runs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Bring curves (steps, values) to common steps (P,): return these and scores (P, R, 1).
+    """Bring curves, steps and values (P, M) of each run, to common steps (P,): return these and scores (P, R, M).
 
     The steps are those of all runs, as far as every run reaches; between its own, a run's values are interpolated. More
-    than POINTS become so many by the mean of neighbours. Raises ValueError if runs have no steps in common.
+    than POINTS become so many by the mean of neighbours. Where runs have played different numbers of levels, each run's
+    mean is what compares, and M is 1. Raises ValueError if runs have no steps in common.
     """
+    if len({values.shape[1] for _, values in runs}) > 1:
+        runs = [(steps, values.mean(1, keepdims=True)) for steps, values in runs]
     first, last = max(steps[0] for steps, _ in runs), min(steps[-1] for steps, _ in runs)
     if first > last:
         raise ValueError("the curves of an agent's seeds have no steps in common; leave out the shortest run")
     steps = np.unique(np.concatenate([steps for steps, _ in runs]))
     steps = steps[(first <= steps) & (steps <= last)]
-    values = np.stack([np.interp(steps, *run) for run in runs], axis=-1)  # (all steps, R)
+    curves = [[np.interp(steps, at, level) for level in values.T] for at, values in runs]  # R x M x (all steps,)
+    values = np.moveaxis(np.array(curves), -1, 0)  # (all steps, R, M)
     parts = np.array_split(np.arange(len(steps)), min(len(steps), POINTS))
-    scores = np.stack([values[part].mean(0) for part in parts])[..., None]  # (P, R, 1)
+    scores = np.stack([values[part].mean(0) for part in parts])  # (P, R, M)
     return np.array([steps[part].mean() for part in parts]), scores
 
 
 def draw_metric(axis: Axes, name: str, agents: dict[str, list[EventAccumulator]]) -> dict[str, np.ndarray]:
-    """Draw a scalar of every agent, its runs by label; return each one's last scores (R, 1)."""
+    """Draw a curve of every agent, its runs by label; return each one's last scores (R, M)."""
     last = {}
     for (label, runs), color in zip(agents.items(), itertools.cycle(color_sequences["petroff10"]), strict=False):
         steps, scores = align([read_curve(run, name) for run in runs])
         marker = "o" if len(steps) == 1 else None  # a line of one point is not to be seen
         seeds = f"{len(runs)} seed{'s' * (len(runs) > 1)}"
         axis.plot(steps, iqm(scores), color=color, marker=marker, label=f"{label}, {seeds}")
-        if (band := interval(scores)) is not None:
+        if len(runs) > 1:
+            band = np.stack([interval(point) for point in scores], axis=-1)  # (2, P), a point at a time: it is memory
             axis.fill_between(steps, *band, color=color, alpha=0.2, linewidth=0)
         last[label] = scores[-1]
     axis.set(xlabel="steps", ylabel=name)

@@ -1464,9 +1464,11 @@ def train(args: Args, run: Run) -> str:
                 began = time.perf_counter()
                 scalars, episodes = iterate(args, run, (iteration - 1) * batch_size)
                 seconds += time.perf_counter() - began
-                if run.eval_envs is not None and (iteration % args.eval_interval == 0 or iteration == iterations):
-                    scalars |= evaluation_scalars(run, args)
                 step = iteration * batch_size
+                if run.eval_envs is not None and (iteration % args.eval_interval == 0 or iteration == iterations):
+                    for name, scores in evaluation(run, args).items():
+                        scalars[f"eval/{name}"] = scores.mean().item()
+                        run.writer.add_tensor(f"eval_levels/{name}", scores, step)
                 scalars["charts/SPS"] = step / seconds
                 for name, value in scalars.items():
                     run.writer.add_scalar(name, value, step)
@@ -1497,17 +1499,18 @@ def iterate(args: Args, run: Run, step: int) -> tuple[dict[str, float], dict[str
     return scalars | {name: float(np.mean(values)) for name, values in episodes.items()}, episodes
 
 
-def evaluation_scalars(run: Run, args: Args) -> dict[str, float]:
-    """Return the means over an evaluation's episodes; training goes on as if there had been none.
+def evaluation(run: Run, args: Args) -> dict[str, Tensor]:
+    """Return an evaluation's numbers by name, each level's mean over its repeats, (--eval-levels,) float64.
 
-    What only an episode's end tells has no mean if an episode was cut short: the best ones would be left out.
+    Training goes on as if there had been none. What only an episode's end tells is not there if an episode was cut
+    short: the best ones would be left out.
     """
     device = run.rollout.values.device
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(args.seed)
         found = evaluate(run.agent, run.eval_envs, args)
-    told = {name: values for name, values in found.items() if not np.isnan(values).any()}  # by every episode
-    return {f"eval/{name}": float(np.mean(values)) for name, values in told.items()}
+    told = {name: torch.from_numpy(values) for name, values in found.items() if not np.isnan(values).any()}
+    return {name: values.unflatten(0, (-1, args.eval_repeats)).mean(1) for name, values in told.items()}
 
 
 def main(args: Args) -> str:

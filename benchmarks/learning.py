@@ -146,24 +146,22 @@ def train(config: Config, task: Task, agent: str, seed: int) -> None:
 
 
 def curves(folders: list[str], metric: str) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield, of each run, the steps, the seconds since it began, and the scores at its evaluations, (P,) each.
+    """Yield, of each run's evaluations, the steps (P,), the seconds since it began (P,), and the levels' scores (P, M).
 
     The seconds include the evaluations.
     """
     for folder in folders:
-        run = EventAccumulator(folder, size_guidance={"scalars": 0})
-        run.Reload()
-        points = run.Scalars(f"eval/{metric}")
+        run = evaluate.read_run(folder)
+        steps, scores = evaluate.read_curve(run, f"eval/{metric}")
         began = run.Tensors("hyperparameters/text_summary")[0].wall_time
-        rows = [(point.step, point.wall_time - began, point.value) for point in points]
-        yield tuple(np.array(rows).T)
+        yield steps, np.array([point.wall_time - began for point in run.Scalars(f"eval/{metric}")]), scores
 
 
 def row(agent: str, folders: list[str], metric: str, best: float) -> str:
     """Return the agent's row: its last score, and what it took to nine tenths of the best score of all agents."""
-    steps, seconds, scores = map(np.stack, zip(*curves(folders, metric), strict=True))  # (R, P) each
-    last, ends = evaluate.iqm(scores[:, -1:]), evaluate.interval(scores[:, -1:])
-    middle = evaluate.iqm(scores.T[..., None])  # (P,)
+    steps, seconds, scores = map(np.stack, zip(*curves(folders, metric), strict=True))  # (R, P), (R, P), (R, P, M)
+    last, ends = evaluate.iqm(scores[:, -1]), evaluate.interval(scores[:, -1])
+    middle = evaluate.iqm(scores.swapaxes(0, 1))  # (P,)
     reached = np.flatnonzero(middle >= 0.9 * best)
     taken = ("never", "")
     if reached.size:
@@ -177,7 +175,7 @@ def report(config: Config, name: str) -> None:
     """Print a task's table."""
     task = TASKS[name]
     folders = {agent: [folder_of(config, task, agent, seed) for seed in config.seeds] for agent in config.agents}
-    scores = [evaluate.iqm(np.stack([c[2][-1:] for c in curves(each, task.metric)])) for each in folders.values()]
+    scores = [evaluate.iqm(np.stack([c[2][-1] for c in curves(each, task.metric)])) for each in folders.values()]
     print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {task.total_timesteps:,} steps\n")
     print("| agent | seeds | IQM | 95 % interval | steps to 0.9 of the best | seconds | seconds in all |")
     print("|---|---:|---:|---|---:|---:|---:|")

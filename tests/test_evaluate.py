@@ -130,15 +130,24 @@ def test_own_metric_is_told_by_the_environment(env_id):
 # ---- curves ----
 def test_curves_on_common_steps():
     steps, scores = evaluate.align(
-        [(np.array([0, 10, 20]), np.array([0.0, 1.0, 3.0])), (np.array([5, 15]), np.array([4.0, 8.0]))]
+        [
+            (np.array([0, 10, 20]), np.array([[0.0, 5.0], [1.0, 5.0], [3.0, 5.0]])),
+            (np.array([5, 15]), np.array([[4.0, 0.0], [8.0, 2.0]])),
+        ]
     )
     assert steps.tolist() == [5, 10, 15]
     assert scores[..., 0].tolist() == [[0.5, 4], [1, 6], [2, 8]]
+    assert scores[..., 1].tolist() == [[5, 0], [5, 1], [5, 2]]
+
+
+def test_curves_of_different_levels_are_compared_by_their_means():
+    runs = [(np.array([1, 2]), np.array([[0.0, 4.0], [2.0, 4.0]])), (np.array([1, 2]), np.array([[1.0], [5.0]]))]
+    assert evaluate.align(runs)[1].tolist() == [[[2], [1]], [[3], [5]]]
 
 
 def test_dense_curves_are_averaged():
     steps = np.arange(1, 10 * evaluate.POINTS + 1)
-    common, scores = evaluate.align([(steps, steps * 2.0)])
+    common, scores = evaluate.align([(steps, steps[:, None] * 2.0)])
     assert len(common) == evaluate.POINTS
     assert common[0] == 5.5  # of 1 to 10
     assert np.array_equal(scores[:, 0, 0], common * 2)
@@ -146,7 +155,7 @@ def test_dense_curves_are_averaged():
 
 def test_curves_without_common_steps():
     with pytest.raises(ValueError, match="no steps in common"):
-        evaluate.align([(np.array([1, 2]), np.zeros(2)), (np.array([3]), np.zeros(1))])
+        evaluate.align([(np.array([1, 2]), np.zeros((2, 1))), (np.array([3]), np.zeros((1, 1)))])
 
 
 @pytest.fixture(scope="module")
@@ -168,6 +177,7 @@ def test_curves_drawn(agents, scalars, capsys):
     assert [agent["agent"] for agent in task["agents"]] == ["ppo_gru", "ppo_trxl"]
     ends = [scalars(folder)["eval/length"][-1] for folder in agents[:2]]
     assert task["agents"][0]["metrics"]["eval/length"]["mean"] == pytest.approx(np.mean(ends))
+    assert np.mean(task["agents"][0]["metrics"]["eval/length"]["scores"], -1) == pytest.approx(ends), "of two levels"
     assert "| eval/length | ppo_gru | 2 |" in capsys.readouterr().out
 
 
@@ -199,6 +209,8 @@ def test_evaluations_are_shown_before_training_episodes(agents):
     runs = [evaluate.read_run(folder) for folder in agents]
     assert evaluate.curve_name("length", runs) == "eval/length"
     assert evaluate.curve_name("episode/length", runs[:1]) == "episode/length"
+    assert evaluate.read_curve(runs[0], "eval/length")[1].shape == (2, 2), "two evaluations of two levels"
+    assert evaluate.read_curve(runs[0], "episode/length")[1].shape == (2, 1)
 
 
 def test_the_arguments_of_an_older_run():
@@ -211,7 +223,7 @@ def test_the_arguments_of_an_older_run():
     defaults = {name: str(value) for name, value in asdict(ppo_gru.Args()).items()}
     changed = {"script": "ppo_gru", "seed": "3", "num_envs": "4", "env_id": "A-v0"}
     assert evaluate.hyperparameters(run) == defaults | changed
-    assert [each.tolist() for each in evaluate.read_curve(run, "eval/return")] == [[10], [2]]
+    assert [each.tolist() for each in evaluate.read_curve(run, "eval/return")] == [[10], [[2]]]
 
 
 # ---- scores ----
