@@ -268,7 +268,7 @@ def draw_metric(axis: Axes, name: str, agents: dict[str, list[EventAccumulator]]
         seeds = f"{len(runs)} seed{'s' * (len(runs) > 1)}"
         axis.plot(steps, iqm(scores), color=color, marker=marker, label=f"{label}, {seeds}")
         if len(runs) > 1:
-            band = np.stack([interval(point) for point in scores], axis=-1)  # (2, P), a point at a time: it is memory
+            band = np.stack([interval(point) for point in scores], axis=-1)  # (2, P); one after the other saves memory
             axis.fill_between(steps, *band, color=color, alpha=0.2, linewidth=0)
         last[label] = scores[-1]
     axis.set(xlabel="steps", ylabel=name)
