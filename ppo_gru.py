@@ -975,7 +975,7 @@ def collect(
             if recorder is not None and done[0]:
                 recorder.end_episode()
         _, last_value, _, _ = agent.act(on_device(play.obs, device), play.live)
-    if agent.encoder.pixels and device.type == "cpu":  # elsewhere, encoding costs less than to look for equals
+    if agent.encoder.pixels and device.type == "cpu":  # where encoding is most of the work
         rollout.alike.copy_(first_alike(rollout.obs))
     return last_value, episodes
 

@@ -166,9 +166,10 @@ def row(agent: str, folders: list[str], metric: str, best: float) -> str:
     taken = ("never", "")
     if reached.size:
         taken = (f"{steps[0, reached[0]]:,.0f}", f"{seconds[:, reached[0]].mean():.0f}")
+    mean = scores[:, -1].mean()
     span = "none: one seed" if ends is None else "{:.2f} to {:.2f}".format(*ends)
     whole = f"{seconds[:, -1].mean():.0f}"
-    return f"| {agent} | {len(folders)} | {last:.2f} | {span} | {taken[0]} | {taken[1]} | {whole} |"
+    return f"| {agent} | {len(folders)} | {mean:.2f} | {last:.2f} | {span} | {taken[0]} | {taken[1]} | {whole} |"
 
 
 def report(config: Config, name: str) -> None:
@@ -177,8 +178,8 @@ def report(config: Config, name: str) -> None:
     folders = {agent: [folder_of(config, task, agent, seed) for seed in config.seeds] for agent in config.agents}
     scores = [evaluate.iqm(np.stack([c[2][-1] for c in curves(each, task.metric)])) for each in folders.values()]
     print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {task.total_timesteps:,} steps\n")
-    print("| agent | seeds | IQM | 95 % interval | steps to 0.9 of the best | seconds | seconds in all |")
-    print("|---|---:|---:|---|---:|---:|---:|")
+    print("| agent | seeds | mean | IQM | 95 % interval | steps to 0.9 of the best | seconds | seconds in all |")
+    print("|---|---:|---:|---:|---|---:|---:|---:|")
     for agent, each in folders.items():
         print(row(agent, each, task.metric, float(max(scores))))
 
