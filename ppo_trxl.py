@@ -537,6 +537,16 @@ class AtariCNN(nn.Sequential):
         return scaled.permute(0, 3, 1, 2)
 
 
+def rounded_up(x: Tensor, multiple: int = 16) -> Tensor:
+    """Append rows of zeros to x (B, ...) up to a multiple, where a CPU computes in bfloat16.
+
+    It compiles these kernels for every number of rows that it meets, which can take longer than running them.
+    """
+    if not torch.is_autocast_enabled("cpu") or x.device.type != "cpu":
+        return x
+    return F.pad(x, (*(x.dim() - 1) * (0, 0), 0, -len(x) % multiple))
+
+
 class Encoder(nn.Module):
     """Encodes each part of an observation, concatenates the features and embeds them in the memory's width (5.1).
 
@@ -562,12 +572,13 @@ class Encoder(nn.Module):
 
     def forward(self, obs: dict[str, Tensor]) -> Tensor:
         """Encode observations of B steps, each part (B, ...), to (B, D)."""
+        rows, obs = len(next(iter(obs.values()))), {name: rounded_up(part) for name, part in obs.items()}
         features = [cnn(obs[name]) for cnn, name in zip(self.cnns, self.pixels, strict=True)]
         if self.vectors:
             vector = torch.cat([obs[name].float() for name in self.vectors], -1)
             features.append(F.relu(self.mlp(with_frequencies(vector, self.frequencies))))
         features = torch.cat(features, -1) if len(features) > 1 else features[0]
-        return F.relu(self.embedding(features)).float()
+        return F.relu(self.embedding(features))[:rows].float()
 
 
 class Decoder(nn.Sequential):
@@ -614,10 +625,10 @@ class Heads(nn.Module):
 
     def forward(self, x: Tensor) -> tuple[list[Categorical], Tensor, Tensor]:
         """Map what the memory says, (B, D), to a distribution of each branch, values (B,) and features (B, F)."""
-        features = F.relu(self.trunk(x))
-        logits = self.policy(features).float().split(self.branches, -1)
-        policy = [Categorical(logits=part, validate_args=False) for part in logits]
-        return policy, self.value(features)[:, 0].float(), features
+        features = F.relu(self.trunk(rounded_up(x)))
+        logits, values = self.policy(features)[: len(x)].float(), self.value(features)[: len(x), 0].float()
+        policy = [Categorical(logits=part, validate_args=False) for part in logits.split(self.branches, -1)]
+        return policy, values, features[: len(x)]
 
 
 def head(size: int, outputs: int, gain: float) -> nn.Sequential:

@@ -63,6 +63,28 @@ def test_chunks_do_not_change_the_features():
     torch.testing.assert_close(cnn(pixels), whole)
 
 
+def test_rows_are_rounded_up_in_bfloat16_and_change_nothing():
+    torch.manual_seed(0)
+    agent = Agent(PIXELS, gym.spaces.Discrete(4), Args(hidden_size=32, head_size=32))
+    pixels = torch.zeros(16, 84, 84, 3, dtype=torch.uint8)
+    pixels[:5] = torch.randint(0, 256, (5, 84, 84, 3))
+    taken, found = [], []
+    agent.encoder.cnns[0].register_forward_pre_hook(lambda _, inputs: taken.append(len(inputs[0])))
+    for rows in (5, 16):
+        agent.zero_grad()
+        with torch.autocast("cpu", torch.bfloat16):
+            policy, values, features = agent.heads(agent.encoder({"observation": pixels[:rows]}))
+        assert [len(part) for part in (policy[0].logits, values, features)] == [rows, rows, rows]
+        parts = [part[:5] for part in (policy[0].logits, values, features)]
+        sum(part.float().square().sum() for part in parts).backward()
+        gradients = [parameter.grad for name, parameter in agent.named_parameters() if "memory" not in name]
+        found.append([*parts, *gradients])
+    assert taken == [16, 16]
+    for got, want in zip(*found, strict=True):
+        torch.testing.assert_close(got, want, rtol=0, atol=0)
+    assert len(ppo_gru.rounded_up(pixels[:5])) == 5, "float32 kernels take any size"
+
+
 def test_bytes_are_scaled_to_one():
     assert AtariCNN.scale(torch.full((1, 2, 4, 3), 255, dtype=torch.uint8)).max() == 1
     assert AtariCNN.scale(torch.zeros(1, 2, 4, 3, dtype=torch.uint8)).shape == (1, 3, 2, 4)
