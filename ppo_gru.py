@@ -25,7 +25,7 @@ import os
 import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from typing import Any, Literal
@@ -406,6 +406,17 @@ def gae(
     return advantages
 
 
+def draw(policy: list[Categorical]) -> Tensor:
+    """Draw an action of every branch, (B, A): the very ones that `sample` draws, but a GPU is asked for no number."""
+    races = [branch.probs / torch.empty_like(branch.probs).exponential_() for branch in policy]
+    return torch.stack([race.argmax(-1) for race in races], -1)
+
+
+def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
+    """Return the log-probability (B, A) of the chosen action (B, A) of every branch."""
+    return torch.stack([branch.log_prob(action) for branch, action in zip(policy, actions.unbind(-1), strict=True)], -1)
+
+
 def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tensor:
     """Return the clipped surrogate loss (2.41) of log_ratio (R, A), averaged over branches (5.4) and steps."""
     ratio, advantages = log_ratio.exp(), advantages[:, None]
@@ -443,7 +454,7 @@ class Pieces:
     """Runs of consecutive steps of one lane each. Step t of lane n has the flat index t * N + n."""
 
     first: Tensor  # (S,) flat index of each piece's first step
-    length: Tensor  # (S,) steps of each piece
+    length: Tensor  # (S,) steps of each piece, on the CPU, as shapes depend on it
     lanes: int  # N
 
     @classmethod
@@ -456,16 +467,32 @@ class Pieces:
 
     def steps(self) -> Tensor:
         """Return the flat indices (R,) of all steps, piece after piece."""
-        return self.first.repeat_interleave(self.length) + self.within() * self.lanes
+        return self.unpad(self.first[:, None] + self.places(self.first.device) * self.lanes)
 
     def within(self) -> Tensor:
         """Return which step of its piece, counted from 0, each step (R,) is."""
-        start = self.length.cumsum(0) - self.length
-        return torch.arange(int(self.length.sum())) - start.repeat_interleave(self.length)
+        return self.unpad(self.places().expand(len(self.length), -1))
 
-    def slots(self) -> Tensor:
-        """Return where the steps (R,) lie among the S x L places of the pieces, each padded to the longest."""
-        return (torch.arange(int(self.length.max())) < self.length[:, None]).flatten().nonzero()[:, 0]
+    def places(self, device: torch.device | None = None) -> Tensor:
+        """Number the places (L,) of a piece that is padded to the longest."""
+        return torch.arange(int(self.length.max()), device=device)
+
+    def even(self) -> bool:
+        """Tell whether all pieces have the same length, so that there is no padding."""
+        return bool((self.length == self.length[0]).all())
+
+    def pad(self, x: Tensor) -> Tensor:
+        """Pad what belongs to the steps, (R, D), with zeros to the longest piece: (S, L, D)."""
+        if self.even():
+            return x.unflatten(0, (len(self.length), -1))
+        return pad_sequence(x.split(self.length.tolist()), batch_first=True)
+
+    def unpad(self, y: Tensor) -> Tensor:
+        """Drop the padding: (S, L, ...) to (R, ...)."""
+        if self.even():
+            return y.flatten(0, 1)
+        real = (self.places() < self.length[:, None]).flatten().nonzero()[:, 0]
+        return y.flatten(0, 1).index_select(0, real.to(y.device))
 
     def minibatches(self, count: int) -> Iterator["Pieces"]:
         """Shuffle the pieces and deal them, whole, into count minibatches of nearly the same number of steps."""
@@ -752,9 +779,9 @@ class Memory(nn.Module):
         live = stored.flatten(0, 1)[pieces.first.to(x.device)]  # (S, P, D)
         if self.packed and x.device.type == "cpu":
             return self.scan(x, pieces, live)
-        y, _ = self.recur(pad_sequence(x.split(pieces.length.tolist()), batch_first=True), live)  # (S, L, D)
+        y, _ = self.recur(pieces.pad(x), live)  # (S, L, D)
         # The padding ends here: what follows, the losses' means (5.8) included, sees real steps only.
-        return y.flatten(0, 1).index_select(0, pieces.slots().to(x.device))
+        return pieces.unpad(y)
 
     def scan(self, x: Tensor, pieces: Pieces, live: Tensor) -> Tensor:
         """Do for the steps x (R, D), piece after piece, what `recur` does for padded pieces."""
@@ -804,13 +831,14 @@ class Agent(nn.Module):
         return policy, values, live, stored
 
     def unroll(
-        self, obs: dict[str, Tensor], which: Tensor, pieces: Pieces, stored: Any
+        self, obs: dict[str, Tensor], which: Tensor | None, pieces: Pieces, stored: Any
     ) -> tuple[list[Categorical], Tensor, Tensor]:
         """Recompute the distributions, values (R,) and features (R, F) of the pieces' steps, in the pieces' order.
 
-        which (R,) is the row of obs that each step observed.
+        which (R,) is the row of obs that each step observed, None if there is a row a step.
         """
-        return self.heads(self.memory.unroll(self.encoder(obs).index_select(0, which), pieces, stored))
+        x = self.encoder(obs) if which is None else self.encoder(obs).index_select(0, which)
+        return self.heads(self.memory.unroll(x, pieces, stored))
 
 
 class MemoryLimit(ValueError):
@@ -909,7 +937,7 @@ class Rollout:
     truncation_values: Tensor  # (T, N) value of the final observation, where bootstrapped
     ground_truth: Tensor | None  # (T, N, G), if it is estimated
     memory: Any  # what the memory stores of the steps
-    alike: Tensor  # (T * N,) flat index of the step whose observation stands for this one's, on the CPU
+    alike: Tensor | None  # (T * N,) flat index of the step whose observation stands for this one's, if any may
 
 
 @dataclass
@@ -931,6 +959,7 @@ def make_rollout(agent: Agent, play: Play, num_steps: int, device: torch.device)
         return torch.zeros(num_steps, lanes, *shape, dtype=dtype, device=device)
 
     branches = len(agent.heads.branches)
+    seek = agent.encoder.pixels and device.type == "cpu"  # where encoding is most of the work
     return Rollout(
         obs={name: empty(*part.shape[1:], dtype=part.dtype) for name, part in on_device(play.obs, device).items()},
         actions=empty(branches, dtype=torch.int64),
@@ -942,7 +971,7 @@ def make_rollout(agent: Agent, play: Play, num_steps: int, device: torch.device)
         truncation_values=empty(),
         ground_truth=empty(play.ground_truth.shape[1]) if play.ground_truth is not None else None,
         memory=agent.memory.storage(num_steps, lanes, device),
-        alike=torch.arange(num_steps * lanes),
+        alike=torch.arange(num_steps * lanes) if seek else None,
     )
 
 
@@ -986,7 +1015,7 @@ def collect(
             if recorder is not None and done[0]:
                 recorder.end_episode()
         _, last_value, _, _ = agent.act(on_device(play.obs, device), play.live)
-    if agent.encoder.pixels and device.type == "cpu":  # where encoding is most of the work
+    if rollout.alike is not None:
         rollout.alike.copy_(first_alike(rollout.obs))
     return last_value, episodes
 
@@ -1004,14 +1033,9 @@ def decide(agent: Agent, play: Play, rollout: Rollout, t: int) -> tuple[Tensor, 
         {name: part[t] for name, part in rollout.obs.items()}, play.live
     )
     agent.memory.store(rollout.memory, t, stored)
-    actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
+    actions = draw(policy)  # (N, A)
     rollout.actions[t], rollout.log_probs[t] = actions, log_probs_of(policy, actions)
     return actions, live
-
-
-def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
-    """Return the log-probability (B, A) of the chosen action (B, A) of every branch."""
-    return torch.stack([branch.log_prob(action) for branch, action in zip(policy, actions.unbind(-1), strict=True)], -1)
 
 
 def on_device(obs: dict[str, Tensor], device: torch.device) -> dict[str, Tensor]:
@@ -1057,9 +1081,10 @@ def minibatch_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the total loss (5.7) of the pieces' steps and the numbers to log; targets: advantages, returns (T, N)."""
     device = rollout.values.device
-    steps = pieces.steps()  # (R,)
-    distinct, which = rollout.alike[steps].unique(return_inverse=True)  # equals are encoded once
-    steps, distinct, which = steps.to(device), distinct.to(device), which.to(device)
+    steps = pieces.steps().to(device)  # (R,)
+    distinct, which = steps, None
+    if rollout.alike is not None:
+        distinct, which = rollout.alike[steps].unique(return_inverse=True)  # equals are encoded once
 
     def take(stored: Tensor, rows: Tensor = steps) -> Tensor:
         return stored.flatten(0, 1).index_select(0, rows)
@@ -1077,7 +1102,7 @@ def minibatch_loss(
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
     logs = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, **policy_numbers(log_ratio, args)}
     if agent.decoder is not None:
-        pixels = obs[agent.encoder.pixels[0]].index_select(0, which)
+        pixels = take(rollout.obs[agent.encoder.pixels[0]])
         with autocast(args, device):
             drawn = agent.decoder(features)
         logs["reconstruction_loss"] = reconstruction_loss(drawn.float(), pixels)
@@ -1126,16 +1151,20 @@ def update(
             loss.backward()
             log["losses/grad_norm"] = clip_gradients(agent, args)
             optimizer.step()
-            logs.append(log)
-        if args.target_kl is not None:
-            epoch = logs[-args.num_minibatches :]
-            if torch.stack([log["losses/approx_kl"] for log in epoch]).mean() > args.target_kl:
-                break
-    means = {name: torch.stack([log[name] for log in logs]).mean().item() for name in logs[0]}
+            logs.append(torch.stack([*log.values()]))
+        epoch = logs[-args.num_minibatches :]
+        if args.target_kl is not None and named_means(log, epoch)["losses/approx_kl"] > args.target_kl:
+            break
+    means = named_means(log, logs)
     # Before the first gradient step the weights are the rollout's, and so must be every probability.
-    means["losses/ratio_error"] = logs[0]["losses/ratio_error"].item()
+    means["losses/ratio_error"] = named_means(log, logs[:1])["losses/ratio_error"]
     means["losses/explained_variance"] = explained_variance(rollout.values, returns)
     return means | {f"charts/{name}": value for name, value in agent.memory.numbers(pieces, rollout.memory).items()}
+
+
+def named_means(names: Iterable[str], rows: list[Tensor]) -> dict[str, float]:
+    """Return each column's mean over the rows, by name."""
+    return dict(zip(names, torch.stack(rows).mean(0).tolist(), strict=True))
 
 
 def clip_gradients(agent: Agent, args: Args) -> Tensor:
@@ -1173,8 +1202,8 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
                 live = agent.memory.refresh(live, stored)
             policy, _, live, item = agent.act(on_device(as_tensors(obs), device), live)
             agent.memory.store(stored, t % memory_steps, item)
-            actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
-            obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
+            actions = to_env_actions(draw(policy), envs.single_action_space)
+            obs, rewards, terminated, truncated, infos = envs.step(actions)
             done = terminated | truncated
             live = agent.memory.reset(live, torch.as_tensor(done))
             found["return"] += rewards * playing

@@ -29,10 +29,10 @@ import os
 import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -430,6 +430,17 @@ def gae(
     return advantages
 
 
+def draw(policy: list[Categorical]) -> Tensor:
+    """Draw an action of every branch, (B, A): the very ones that `sample` draws, but a GPU is asked for no number."""
+    races = [branch.probs / torch.empty_like(branch.probs).exponential_() for branch in policy]
+    return torch.stack([race.argmax(-1) for race in races], -1)
+
+
+def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
+    """Return the log-probability (B, A) of the chosen action (B, A) of every branch."""
+    return torch.stack([branch.log_prob(action) for branch, action in zip(policy, actions.unbind(-1), strict=True)], -1)
+
+
 def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tensor:
     """Return the clipped surrogate loss (2.41) of log_ratio (R, A), averaged over branches (5.4) and steps."""
     ratio, advantages = log_ratio.exp(), advantages[:, None]
@@ -467,7 +478,7 @@ class Pieces:
     """Runs of consecutive steps of one lane each. Step t of lane n has the flat index t * N + n."""
 
     first: Tensor  # (S,) flat index of each piece's first step
-    length: Tensor  # (S,) steps of each piece
+    length: Tensor  # (S,) steps of each piece, on the CPU, as shapes depend on it
     lanes: int  # N
 
     @classmethod
@@ -480,16 +491,32 @@ class Pieces:
 
     def steps(self) -> Tensor:
         """Return the flat indices (R,) of all steps, piece after piece."""
-        return self.first.repeat_interleave(self.length) + self.within() * self.lanes
+        return self.unpad(self.first[:, None] + self.places(self.first.device) * self.lanes)
 
     def within(self) -> Tensor:
         """Return which step of its piece, counted from 0, each step (R,) is."""
-        start = self.length.cumsum(0) - self.length
-        return torch.arange(int(self.length.sum())) - start.repeat_interleave(self.length)
+        return self.unpad(self.places().expand(len(self.length), -1))
 
-    def slots(self) -> Tensor:
-        """Return where the steps (R,) lie among the S x L places of the pieces, each padded to the longest."""
-        return (torch.arange(int(self.length.max())) < self.length[:, None]).flatten().nonzero()[:, 0]
+    def places(self, device: torch.device | None = None) -> Tensor:
+        """Number the places (L,) of a piece that is padded to the longest."""
+        return torch.arange(int(self.length.max()), device=device)
+
+    def even(self) -> bool:
+        """Tell whether all pieces have the same length, so that there is no padding."""
+        return bool((self.length == self.length[0]).all())
+
+    def pad(self, x: Tensor) -> Tensor:
+        """Pad what belongs to the steps, (R, D), with zeros to the longest piece: (S, L, D)."""
+        if self.even():
+            return x.unflatten(0, (len(self.length), -1))
+        return pad_sequence(x.split(self.length.tolist()), batch_first=True)
+
+    def unpad(self, y: Tensor) -> Tensor:
+        """Drop the padding: (S, L, ...) to (R, ...)."""
+        if self.even():
+            return y.flatten(0, 1)
+        real = (self.places() < self.length[:, None]).flatten().nonzero()[:, 0]
+        return y.flatten(0, 1).index_select(0, real.to(y.device))
 
     def minibatches(self, count: int) -> Iterator["Pieces"]:
         """Shuffle the pieces and deal them, whole, into count minibatches of nearly the same number of steps."""
@@ -647,6 +674,19 @@ def visible(age: Tensor, step: Tensor, window: int) -> Tensor:
     return (age >= 1) & (age <= step) & (age <= window)
 
 
+def shapes_may_vary(device: torch.device) -> bool:
+    """Tell whether to look back no further than the oldest episode; a GPU would have to be asked how far that is.
+
+    There the window has one length: nothing waits, and a CUDA graph can be recorded.
+    """
+    return device.type == "cpu"
+
+
+def longest_reach(steps: Tensor, window: int) -> int:
+    """Return how far back any of these steps of their episodes (any shape) may have to look."""
+    return min(max(int(steps.max()), 1), window) if shapes_may_vary(steps.device) else window
+
+
 def sinusoid(position: Tensor, width: int) -> Tensor:
     """Encode positions, steps or ages of any shape, as sines and cosines (2.57, 2.58): (..., width) float64."""
     frequency = 10000 ** (-torch.arange(0, width, 2, dtype=torch.float64, device=position.device) / width)
@@ -750,12 +790,11 @@ class Block(nn.Module):
         return self.merge_output(x, F.relu(self.projection(self.norm_output(x))))
 
 
-@dataclass
-class Live:
+class Live(NamedTuple):
     """The live memory of N lanes, a cache. Its rows are those of the rollout's timeline, and one more."""
 
-    now: int  # the row of the step to come
-    steps: Tensor  # (N,) which step of its episode that is; on the CPU, as shapes depend on it
+    now: Tensor  # (1,) the row of the step to come
+    steps: Tensor  # (N,) which step of its episode that is
     keys: Tensor  # (K, N, W + T + 1, D) made of each block's past inputs
     values: Tensor  # (K, N, W + T + 1, D)
 
@@ -765,7 +804,7 @@ class Timeline:
     """What a rollout stores: row W + t is its step t, and the W rows before are the steps before it."""
 
     items: Tensor  # (W + T, N, K, D) the input of every block, detached
-    steps: Tensor  # (W + T, N) which step of its episode that was; on the CPU
+    steps: Tensor  # (W + T, N) which step of its episode that was
 
 
 class Memory(nn.Module):
@@ -794,15 +833,15 @@ class Memory(nn.Module):
     def initial(self, num_steps: int, lanes: int, device: torch.device) -> Live:
         """Return the live memory of fresh episodes, with room for a rollout of num_steps."""
         cache = (len(self.blocks), lanes, self.window + num_steps + 1, self.width)
-        steps = torch.zeros(lanes, dtype=torch.int64)
+        now, steps = torch.tensor([self.window], device=device), torch.zeros(lanes, dtype=torch.int64, device=device)
         keys, values = (torch.zeros(cache, dtype=self.cache_dtype, device=device) for _ in range(2))
-        return Live(self.window, steps, keys, values)
+        return Live(now, steps, keys, values)
 
     def storage(self, num_steps: int, lanes: int, device: torch.device) -> Timeline:
         """Return room for what a rollout stores."""
         shape = (self.window + num_steps, lanes)
         items = torch.zeros(*shape, len(self.blocks), self.width, device=device)
-        return Timeline(items, torch.zeros(shape, dtype=torch.int64))
+        return Timeline(items, torch.zeros(shape, dtype=torch.int64, device=device))
 
     def store(self, stored: Timeline, t: int, item: tuple[Tensor, Tensor]) -> None:
         """Put away what step t of the rollout has to be remembered for."""
@@ -815,11 +854,11 @@ class Memory(nn.Module):
         """
         for rows in (stored.items, stored.steps):
             rows[: self.window] = rows[len(rows) - self.window :].clone()  # overlaps itself if the window is the longer
-        live = Live(self.window, live.steps, live.keys, live.values)
+        live = live._replace(now=torch.full_like(live.now, self.window))
         rows, _, seen = self.look_back(live)
         seen = seen[:, 0].T  # (M, N)
         items = stored.items[rows].masked_fill(~seen[..., None, None], 0.0)  # (M, N, K, D)
-        position = self.position(stored.steps[rows].to(items.device).where(seen, 0), items.dtype)  # (M, N, D)
+        position = self.position(stored.steps[rows].where(seen, 0), items.dtype)  # (M, N, D)
         for k, block in enumerate(self.blocks):
             keys, values = block.keys_values(items[:, :, k] + position)
             live.keys[k][:, rows], live.values[k][:, rows] = keys.transpose(0, 1), values.transpose(0, 1)
@@ -833,44 +872,44 @@ class Memory(nn.Module):
         """
         self.check_length(live.steps)
         rows, age, seen = self.look_back(live)
-        steps = live.steps.to(x.device)
-        position = self.position(steps, x.dtype)  # (N, D)
-        inputs = []
-        x = x[:, None]  # (N, 1, D)
+        position = self.position(live.steps[:, None], x.dtype)  # (N, 1, D)
+        inputs, x = [], x[:, None]  # (N, 1, D)
         for k, block in enumerate(self.blocks):
-            inputs.append(x[:, 0])
+            inputs.append(x)
             memory = live.keys[k][:, rows], live.values[k][:, rows]  # (N, M, D) each
-            live.keys[k][:, live.now], live.values[k][:, live.now] = block.keys_values(x[:, 0] + position)
-            x = block(x, self.query_encoding(steps[:, None], x.dtype) if k == 0 else 0.0, memory, age, seen)
-        new_live = Live(live.now + 1, live.steps + 1, live.keys, live.values)
-        return x[:, 0], new_live, (torch.stack(inputs, 1), live.steps)
+            for cache, made in zip((live.keys, live.values), block.keys_values(x + position), strict=True):
+                cache[k].index_copy_(1, live.now, made)
+            x = block(x, self.query_encoding(live.steps[:, None], x.dtype) if k == 0 else 0.0, memory, age, seen)
+        new_live = live._replace(now=live.now + 1, steps=live.steps + 1)
+        return x[:, 0], new_live, (torch.cat(inputs, 1), live.steps)
 
     def attention(self, x: Tensor, live: Live) -> Tensor:
         """Return what the step of x (N, D) looks at: weights (N, K, H, M) of the last M steps, the oldest first."""
         rows, age, seen = self.look_back(live)
         x, found = x[:, None], []  # (N, 1, D)
         for k, block in enumerate(self.blocks):
-            position = self.query_encoding(live.steps[:, None].to(x.device), x.dtype) if k == 0 else 0.0
+            position = self.query_encoding(live.steps[:, None], x.dtype) if k == 0 else 0.0
             memory = live.keys[k][:, rows], live.values[k][:, rows]
             found.append(block.attention.weights(block.norm_query(x + position), memory[0], age, seen)[:, :, 0])
             x = block(x, position, memory, age, seen)
         return torch.stack(found, 1)
 
-    def look_back(self, live: Live) -> tuple[slice, Tensor, Tensor]:
-        """Return the cache's rows that a step may see, their ages (1, M), and which of them it sees (N, 1, M)."""
-        longest = min(max(int(live.steps.max()), 1), self.window)  # no further back than the oldest episode
-        rows, device = slice(live.now - longest, live.now), live.keys.device
-        age = torch.arange(longest, 0, -1, device=device)[None]  # (1, M)
-        return rows, age, visible(age, live.steps[:, None].to(device), self.window)[:, None]
+    def look_back(self, live: Live) -> tuple[slice | Tensor, Tensor, Tensor]:
+        """Return the cache's M rows that a step may see, their ages (1, M), and which of them it sees (N, 1, M)."""
+        longest, device = longest_reach(live.steps, self.window), live.steps.device
+        age = torch.arange(longest, 0, -1, device=device)  # (M,)
+        # A slice is a view; the GPU, which cannot be asked where it begins, has to gather the rows.
+        rows = slice(int(live.now) - longest, int(live.now)) if shapes_may_vary(device) else live.now - age
+        return rows, age[None], visible(age, live.steps[:, None], self.window)[:, None]
 
     def reset(self, live: Live, done: Tensor) -> Live:
         """Forget the lanes whose episode ended, where done (N,) is true."""
         rows, _, _ = self.look_back(live)
-        lanes = done.nonzero()[:, 0].to(live.keys.device)
+        lanes = done.nonzero().to(live.steps.device)  # (lanes that end, 1)
         for cache in (live.keys, live.values):
             # Nothing sees these any more. As zeros, not even a NaN among them could pass through a weight of zero.
             cache[:, lanes, rows] = 0.0
-        return Live(live.now, live.steps.masked_fill(done, 0), live.keys, live.values)
+        return live._replace(steps=live.steps.masked_fill(done.to(live.steps.device), 0))
 
     def cut(self, done: Tensor) -> Pieces:
         """Cut a rollout, whose episodes end where done (T, N) is true, into segments: an episode's end needs no cut."""
@@ -879,25 +918,26 @@ class Memory(nn.Module):
 
     def unroll(self, x: Tensor, pieces: Pieces, stored: Timeline) -> Tensor:
         """Run whole segments at once: x (R, D) to (R, D), with the items of the W steps before each segment."""
-        row, lane = self.window + pieces.first[:, None] // pieces.lanes, pieces.first[:, None] % pieces.lanes  # (S, 1)
-        x = pad_sequence(x.split(pieces.length.tolist()), batch_first=True)  # (S, L, D)
-        at = torch.arange(x.shape[1])  # (L,)
-        steps = stored.steps[(row + at).clamp(max=len(stored.steps) - 1), lane].where(at < pieces.length[:, None], 0)
-        back = min(max(int(steps.max()), 1), self.window)  # no further than the longest episode
-        rows = row + torch.arange(-back, x.shape[1] - 1)  # (S, M); a segment's last item is not seen
-        rows = rows.clamp(max=len(stored.steps) - 1)
-        age = (at[:, None] + torch.arange(back, 1 - x.shape[1], -1)).to(x.device)  # (L, M)
-        steps, item_steps = steps.to(x.device), stored.steps[rows, lane].to(x.device)  # (S, L), (S, M)
+        first, last = pieces.first.to(x.device)[:, None], len(stored.steps) - 1
+        row, lane = self.window + first // pieces.lanes, first % pieces.lanes  # (S, 1)
+        x = pieces.pad(x)  # (S, L, D)
+        at = pieces.places(x.device)  # (L,)
+        steps = stored.steps[(row + at).clamp(max=last), lane]  # (S, L)
+        if not pieces.even():
+            steps = steps.where(at < pieces.length.to(x.device)[:, None], 0)
+        back = longest_reach(steps, self.window)
+        item_at = torch.arange(-back, len(at) - 1, device=x.device)  # (M,); a segment's last item is not seen
+        age = at[:, None] - item_at  # (L, M)
+        rows = (row + item_at).clamp(max=last)  # (S, M)
 
         seen = visible(age, steps[..., None], self.window)  # (S, L, M)
         used = seen.any(1)  # (S, M)
-        items = stored.items[rows.to(x.device), lane.to(x.device)]  # (S, M, K, D)
-        items = items.masked_fill(~used[..., None, None], 0.0)
-        position = self.position(item_steps.where(used, 0), x.dtype)  # (S, M, D)
+        items = stored.items[rows, lane].masked_fill(~used[..., None, None], 0.0)  # (S, M, K, D)
+        position = self.position(stored.steps[rows, lane].where(used, 0), x.dtype)  # (S, M, D)
         for k, block in enumerate(self.blocks):
             encoding = self.query_encoding(steps, x.dtype) if k == 0 else 0.0
             x = block(x, encoding, block.keys_values(items[:, :, k] + position), age, seen)
-        return x.flatten(0, 1).index_select(0, pieces.slots().to(x.device))
+        return pieces.unpad(x)
 
     def position(self, steps: Tensor, dtype: torch.dtype) -> Tensor | float:
         """Return the encoding (..., D) of items that were made at these steps of their episodes."""
@@ -967,13 +1007,14 @@ class Agent(nn.Module):
         return policy, values, live, stored
 
     def unroll(
-        self, obs: dict[str, Tensor], which: Tensor, pieces: Pieces, stored: Any
+        self, obs: dict[str, Tensor], which: Tensor | None, pieces: Pieces, stored: Any
     ) -> tuple[list[Categorical], Tensor, Tensor]:
         """Recompute the distributions, values (R,) and features (R, F) of the pieces' steps, in the pieces' order.
 
-        which (R,) is the row of obs that each step observed.
+        which (R,) is the row of obs that each step observed, None if there is a row a step.
         """
-        return self.heads(self.memory.unroll(self.encoder(obs).index_select(0, which), pieces, stored))
+        x = self.encoder(obs) if which is None else self.encoder(obs).index_select(0, which)
+        return self.heads(self.memory.unroll(x, pieces, stored))
 
 
 class MemoryLimit(ValueError):
@@ -1072,7 +1113,7 @@ class Rollout:
     truncation_values: Tensor  # (T, N) value of the final observation, where bootstrapped
     ground_truth: Tensor | None  # (T, N, G), if it is estimated
     memory: Any  # what the memory stores of the steps
-    alike: Tensor  # (T * N,) flat index of the step whose observation stands for this one's, on the CPU
+    alike: Tensor | None  # (T * N,) flat index of the step whose observation stands for this one's, if any may
 
 
 @dataclass
@@ -1094,6 +1135,7 @@ def make_rollout(agent: Agent, play: Play, num_steps: int, device: torch.device)
         return torch.zeros(num_steps, lanes, *shape, dtype=dtype, device=device)
 
     branches = len(agent.heads.branches)
+    seek = agent.encoder.pixels and device.type == "cpu"  # where encoding is most of the work
     return Rollout(
         obs={name: empty(*part.shape[1:], dtype=part.dtype) for name, part in on_device(play.obs, device).items()},
         actions=empty(branches, dtype=torch.int64),
@@ -1105,7 +1147,7 @@ def make_rollout(agent: Agent, play: Play, num_steps: int, device: torch.device)
         truncation_values=empty(),
         ground_truth=empty(play.ground_truth.shape[1]) if play.ground_truth is not None else None,
         memory=agent.memory.storage(num_steps, lanes, device),
-        alike=torch.arange(num_steps * lanes),
+        alike=torch.arange(num_steps * lanes) if seek else None,
     )
 
 
@@ -1149,7 +1191,7 @@ def collect(
             if recorder is not None and done[0]:
                 recorder.end_episode()
         _, last_value, _, _ = agent.act(on_device(play.obs, device), play.live)
-    if agent.encoder.pixels and device.type == "cpu":  # where encoding is most of the work
+    if rollout.alike is not None:
         rollout.alike.copy_(first_alike(rollout.obs))
     return last_value, episodes
 
@@ -1167,14 +1209,9 @@ def decide(agent: Agent, play: Play, rollout: Rollout, t: int) -> tuple[Tensor, 
         {name: part[t] for name, part in rollout.obs.items()}, play.live
     )
     agent.memory.store(rollout.memory, t, stored)
-    actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
+    actions = draw(policy)  # (N, A)
     rollout.actions[t], rollout.log_probs[t] = actions, log_probs_of(policy, actions)
     return actions, live
-
-
-def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
-    """Return the log-probability (B, A) of the chosen action (B, A) of every branch."""
-    return torch.stack([branch.log_prob(action) for branch, action in zip(policy, actions.unbind(-1), strict=True)], -1)
 
 
 def on_device(obs: dict[str, Tensor], device: torch.device) -> dict[str, Tensor]:
@@ -1220,9 +1257,10 @@ def minibatch_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the total loss (5.7) of the pieces' steps and the numbers to log; targets: advantages, returns (T, N)."""
     device = rollout.values.device
-    steps = pieces.steps()  # (R,)
-    distinct, which = rollout.alike[steps].unique(return_inverse=True)  # equals are encoded once
-    steps, distinct, which = steps.to(device), distinct.to(device), which.to(device)
+    steps = pieces.steps().to(device)  # (R,)
+    distinct, which = steps, None
+    if rollout.alike is not None:
+        distinct, which = rollout.alike[steps].unique(return_inverse=True)  # equals are encoded once
 
     def take(stored: Tensor, rows: Tensor = steps) -> Tensor:
         return stored.flatten(0, 1).index_select(0, rows)
@@ -1240,7 +1278,7 @@ def minibatch_loss(
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
     logs = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, **policy_numbers(log_ratio, args)}
     if agent.decoder is not None:
-        pixels = obs[agent.encoder.pixels[0]].index_select(0, which)
+        pixels = take(rollout.obs[agent.encoder.pixels[0]])
         with autocast(args, device):
             drawn = agent.decoder(features)
         logs["reconstruction_loss"] = reconstruction_loss(drawn.float(), pixels)
@@ -1289,16 +1327,20 @@ def update(
             loss.backward()
             log["losses/grad_norm"] = clip_gradients(agent, args)
             optimizer.step()
-            logs.append(log)
-        if args.target_kl is not None:
-            epoch = logs[-args.num_minibatches :]
-            if torch.stack([log["losses/approx_kl"] for log in epoch]).mean() > args.target_kl:
-                break
-    means = {name: torch.stack([log[name] for log in logs]).mean().item() for name in logs[0]}
+            logs.append(torch.stack([*log.values()]))
+        epoch = logs[-args.num_minibatches :]
+        if args.target_kl is not None and named_means(log, epoch)["losses/approx_kl"] > args.target_kl:
+            break
+    means = named_means(log, logs)
     # Before the first gradient step the weights are the rollout's, and so must be every probability.
-    means["losses/ratio_error"] = logs[0]["losses/ratio_error"].item()
+    means["losses/ratio_error"] = named_means(log, logs[:1])["losses/ratio_error"]
     means["losses/explained_variance"] = explained_variance(rollout.values, returns)
     return means | {f"charts/{name}": value for name, value in agent.memory.numbers(pieces, rollout.memory).items()}
+
+
+def named_means(names: Iterable[str], rows: list[Tensor]) -> dict[str, float]:
+    """Return each column's mean over the rows, by name."""
+    return dict(zip(names, torch.stack(rows).mean(0).tolist(), strict=True))
 
 
 def clip_gradients(agent: Agent, args: Args) -> Tensor:
@@ -1336,8 +1378,8 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
                 live = agent.memory.refresh(live, stored)
             policy, _, live, item = agent.act(on_device(as_tensors(obs), device), live)
             agent.memory.store(stored, t % memory_steps, item)
-            actions = torch.stack([branch.sample() for branch in policy], -1)  # (N, A)
-            obs, rewards, terminated, truncated, infos = envs.step(to_env_actions(actions, envs.single_action_space))
+            actions = to_env_actions(draw(policy), envs.single_action_space)
+            obs, rewards, terminated, truncated, infos = envs.step(actions)
             done = terminated | truncated
             live = agent.memory.reset(live, torch.as_tensor(done))
             found["return"] += rewards * playing

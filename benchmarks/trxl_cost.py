@@ -83,7 +83,7 @@ def step_times(config: Config, window: int) -> tuple[float, float]:
     args = ppo_trxl.Args(trxl_memory_length=window, num_steps=config.repeats)
     memory = ppo_trxl.Memory(args)
     live = memory.initial(args.num_steps, args.num_envs, torch.device("cpu"))
-    live.steps += window
+    live.steps.add_(window)
     x = torch.randn(args.num_envs, memory.width)
     split = memory.blocks[0].attention.split
     step, attention = [], []

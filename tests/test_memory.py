@@ -33,9 +33,8 @@ def recompute(run):
     rollout = run.rollout
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
     steps = pieces.steps()
-    distinct, which = rollout.alike[steps].unique(return_inverse=True)
-    obs = {name: part.flatten(0, 1)[distinct] for name, part in rollout.obs.items()}
-    policy, values, _ = run.agent.unroll(obs, which, pieces, rollout.memory)
+    obs = {name: part.flatten(0, 1)[steps] for name, part in rollout.obs.items()}
+    policy, values, _ = run.agent.unroll(obs, None, pieces, rollout.memory)
     log_probs = ppo_gru.log_probs_of(policy, rollout.actions.flatten(0, 1)[steps])
     return steps, (log_probs - rollout.log_probs.flatten(0, 1)[steps]).exp(), values
 
@@ -202,7 +201,7 @@ def test_what_was_observed_before_is_encoded_once(played, env_id):
     run.agent.encoder.register_forward_pre_hook(lambda _, inputs: rows.append(len(next(iter(inputs[0].values())))))
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
     targets, found = 2 * (torch.randn(32, 4),), []
-    for alike in (rollout.alike, torch.arange(len(rollout.alike))):
+    for alike in (rollout.alike, None):
         run.agent.zero_grad()
         loss, _ = ppo_gru.minibatch_loss(
             run.agent, dataclasses.replace(rollout, alike=alike), targets, pieces, 1e-3, args
@@ -235,7 +234,7 @@ def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(pl
     """5,000 steps of one endless episode, far beyond the window and the encodings' usual length."""
     changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"explosion_delay": [1000]}'}
     args, run, *_ = played(script=ppo_trxl, num_envs=1, num_steps=50, num_minibatches=1, **changes)
-    run.play.live.steps += 4050  # as if the episode had been going on for long; its window is still that of 50 steps
+    run.play.live.steps.add_(4050)  # as if the episode had been going on for long; its window is still that of 50 steps
 
     def storage():
         live, stored = run.play.live, run.rollout.memory
@@ -327,13 +326,13 @@ def test_packed_or_padded_is_the_same(played):
 
 
 def moved(part, device):
-    """A copy on the device of what is on a GPU when there is one: all but the numbers of steps."""
+    """A copy on the device of what is on a GPU when there is one."""
     if isinstance(part, torch.Tensor):
         return part.to(device)
     if isinstance(part, dict):
         return {name: moved(each, device) for name, each in part.items()}
     if isinstance(part, ppo_trxl.Timeline):
-        return dataclasses.replace(part, items=part.items.to(device))
+        return ppo_trxl.Timeline(part.items.to(device), part.steps.to(device))
     return part
 
 
@@ -347,11 +346,10 @@ def test_the_update_waits_for_no_device(played, monkeypatch, memory):
     pieces = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated)
     agent = run.agent.to("meta")
     parts = {name: moved(part, "meta") for name, part in vars(run.rollout).items() if name != "alike"}
-    rollout = script.Rollout(**parts, alike=run.rollout.alike)
+    rollout = script.Rollout(**parts, alike=None)
     targets = 2 * (torch.zeros(16, 4, device="meta"),)
     for minibatch in pieces.minibatches(2):
         loss, _ = script.minibatch_loss(agent, rollout, targets, minibatch, 0.1, args)
         loss.backward()
         nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
-        agent.memory.numbers(minibatch, rollout.memory)
     assert all(parameter.grad.device.type == "meta" for parameter in agent.parameters())

@@ -7,7 +7,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ppo_trxl import Args, Attention, Live, Memory, Timeline, sinusoid, visible
+import ppo_trxl
+from ppo_trxl import Args, Attention, Memory, Timeline, sinusoid, visible
 
 ENCODINGS = ["absolute", "learned", "relative", "none"]
 STEPS, LANES, WIDTH = 24, 3, 8
@@ -21,6 +22,11 @@ def make_memory(**changes):
     for parameter in memory.parameters():
         torch.nn.init.normal_(parameter, std=0.5)
     return memory
+
+
+def in_double(live):
+    """The live memory with its cache in float64."""
+    return live._replace(keys=live.keys.double(), values=live.values.double())
 
 
 def make_timeline(memory, seed=1):
@@ -68,8 +74,15 @@ VARIANTS = [
 ] + [{"trxl_positional_encoding": encoding, "trxl_query_position": True} for encoding in ENCODINGS]
 
 
+@pytest.fixture(params=["as on a CPU", "as on a GPU"])
+def shapes(request, monkeypatch):
+    """The window reaches back to the oldest episode's first step, or has one length."""
+    if request.param == "as on a GPU":
+        monkeypatch.setattr(ppo_trxl, "shapes_may_vary", lambda device: False)
+
+
 @pytest.mark.parametrize("changes", VARIANTS)
-def test_unroll_equals_a_window_gathered_for_every_sample(changes):
+def test_unroll_equals_a_window_gathered_for_every_sample(changes, shapes):
     memory = make_memory(**changes)
     stored = make_timeline(memory)
     order = torch.randperm(LANES * math.ceil(STEPS / 8), generator=torch.Generator().manual_seed(2))
@@ -92,11 +105,11 @@ def test_unroll_equals_a_window_gathered_for_every_sample(changes):
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("window", [3, 40])
-def test_playing_equals_unrolling(encoding, window):
+def test_playing_equals_unrolling(encoding, window, shapes):
     """Three rollouts, refreshed in between: an episode of lane 0 spans them all, others end inside them."""
     memory = make_memory(trxl_positional_encoding=encoding, trxl_memory_length=window, trxl_pe_length=80)
     live, stored = memory.initial(STEPS, LANES, torch.device("cpu")), memory.storage(STEPS, LANES, torch.device("cpu"))
-    live.keys, live.values, stored.items = live.keys.double(), live.values.double(), stored.items.double()
+    live, stored.items = in_double(live), stored.items.double()
     generator = torch.Generator().manual_seed(3)
     for _ in range(3):
         x = torch.randn(STEPS, LANES, WIDTH, dtype=torch.float64, generator=generator)
@@ -173,7 +186,7 @@ def test_attention_equals_the_library_s():
 def test_attention_of_a_step():
     memory = make_memory(trxl_positional_encoding="relative")
     live = memory.initial(STEPS, LANES, torch.device("cpu"))
-    live.keys, live.values = live.keys.double(), live.values.double()
+    live = in_double(live)
     for t in range(9):
         x = torch.randn(LANES, WIDTH, dtype=torch.float64)
         weights = memory.attention(x, live)
@@ -185,7 +198,7 @@ def test_attention_of_a_step():
 
 @pytest.mark.parametrize("fill", [1e6, math.nan])
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_what_is_not_seen_changes_nothing(encoding, fill):
+def test_what_is_not_seen_changes_nothing(encoding, fill, shapes):
     memory = make_memory(trxl_positional_encoding=encoding)
     stored = make_timeline(memory)
     pieces = memory.cut(torch.zeros(STEPS, LANES, dtype=torch.bool))
@@ -207,10 +220,10 @@ def test_what_is_not_seen_changes_nothing(encoding, fill):
         assert got.equal(want)
 
 
-def test_a_forgotten_episode_leaves_nothing_in_the_cache():
+def test_a_forgotten_episode_leaves_nothing_in_the_cache(shapes):
     memory = make_memory()
     live = memory.initial(STEPS, 2, torch.device("cpu"))
-    live.keys, live.values = live.keys.double(), live.values.double()
+    live = in_double(live)
     with torch.no_grad():
         for _ in range(4):
             _, live, _ = memory.step(torch.full((2, WIDTH), math.nan).double(), live)
@@ -220,10 +233,10 @@ def test_a_forgotten_episode_leaves_nothing_in_the_cache():
             assert y.isfinite().all()
 
 
-def test_taking_a_step_again_changes_nothing():
+def test_taking_a_step_again_changes_nothing(shapes):
     memory = make_memory()
     live = memory.initial(STEPS, LANES, torch.device("cpu"))
-    live.keys, live.values = live.keys.double(), live.values.double()
+    live = in_double(live)
     with torch.no_grad():
         for _ in range(8):
             x, other = torch.randn(2, LANES, WIDTH).double()
@@ -237,7 +250,7 @@ def test_episodes_longer_than_a_learned_encoding():
     for encoding in ENCODINGS:
         memory = make_memory(trxl_positional_encoding=encoding, trxl_pe_length=6)
         live = memory.initial(STEPS, 1, torch.device("cpu"))
-        live = Live(live.now, live.steps + 5, live.keys.double(), live.values.double())
+        live = in_double(live)._replace(steps=live.steps + 5)
         with torch.no_grad():
             for _ in range(2):  # the sixth step of six, and what follows it, which --bootstrap-truncated values
                 _, live, _ = memory.step(torch.randn(1, WIDTH).double(), live)
