@@ -54,7 +54,15 @@ OWN_METRIC = {
 }
 # Arguments that say how a run was started and recorded, not what learned.
 BOOKKEEPING = {"seed", "torch_deterministic", "cuda", "track", "wandb_project_name", "wandb_entity", "capture_video"}
-BOOKKEEPING |= {"save_model", "eval_interval", "eval_levels", "eval_repeats", "eval_max_steps"}
+BOOKKEEPING |= {
+    "save_model",
+    "eval_interval",
+    "eval_levels",
+    "eval_repeats",
+    "eval_max_steps",
+    "compile",
+    "cuda_graphs",
+}
 RESAMPLES = 2000
 POINTS = 200  # of a curve; one that has more is averaged over neighbours
 

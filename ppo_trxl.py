@@ -29,7 +29,7 @@ import os
 import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -66,6 +66,8 @@ class Args:
     """compute the networks in bfloat16, faster on processors that have it; losses stay in float32"""
     compile: bool = False
     """compile convolutions and heads before training: takes a minute, and on a CPU a C++ compiler"""
+    cuda_graphs: bool = False
+    """on a GPU, replay the act step, and gradient steps of unchanging shapes, as CUDA graphs"""
     track: bool = False
     """log to Weights and Biases too (needs the extra `track`)"""
     wandb_project_name: str = "memory-gym-baselines"
@@ -811,7 +813,8 @@ class Memory(nn.Module):
     """Transformer-XL as an episodic memory with a sliding window (thesis 5.3), or GTrXL.
 
     Every step leaves behind an item, the inputs of the K blocks. A step's query in block k sees the k-th part of the
-    items of up to W steps before it, of the same episode, never its own.
+    items of up to W steps before it, of the same episode, never its own. Raises ValueError for a learned encoding with
+    --cuda-graphs.
     """
 
     # Those that shape the network.
@@ -826,6 +829,10 @@ class Memory(nn.Module):
         self.blocks = nn.ModuleList(Block(args) for _ in range(args.trxl_num_layers))
         for block in self.blocks:
             block_init(block, args.trxl_init, args.trxl_num_layers)
+        if self.encoding == "learned" and args.cuda_graphs:
+            raise ValueError(
+                "--cuda-graphs cannot watch for the end of a learned encoding's table; use another encoding"
+            )
         if self.encoding == "learned":
             rows = args.trxl_pe_length + 1  # one for what follows an episode's last step, which may be valued
             self.table = nn.Parameter(torch.randn(rows, self.width) / math.sqrt(self.width))
@@ -1006,6 +1013,12 @@ class Agent(nn.Module):
         policy, values, _ = self.heads(x)
         return policy, values, live, stored
 
+    def choose(self, obs: dict[str, Tensor], live: Any) -> tuple[Tensor, Tensor, Tensor, Any, Any]:
+        """Do as `act` does and draw: actions (N, A), their log-probabilities, values, live memory, what to store."""
+        policy, values, live, stored = self.act(obs, live)
+        actions = draw(policy)
+        return actions, log_probs_of(policy, actions), values, live, stored
+
     def unroll(
         self, obs: dict[str, Tensor], which: Tensor | None, pieces: Pieces, stored: Any
     ) -> tuple[list[Categorical], Tensor, Tensor]:
@@ -1152,8 +1165,11 @@ def make_rollout(agent: Agent, play: Play, num_steps: int, device: torch.device)
 
 
 def autocast(args: Args, device: torch.device) -> torch.autocast:
-    """Return the context in which the networks compute in bfloat16 with --amp; it keeps the weights' casts."""
-    return torch.autocast(device.type, torch.bfloat16, enabled=args.amp)
+    """Return the context in which the networks compute in bfloat16 with --amp; it keeps the weights' casts.
+
+    But a CUDA graph casts them anew: those that were kept would be of the time of the recording.
+    """
+    return torch.autocast(device.type, torch.bfloat16, enabled=args.amp, cache_enabled=not args.cuda_graphs)
 
 
 @torch.no_grad()
@@ -1205,12 +1221,11 @@ def decide(agent: Agent, play: Play, rollout: Rollout, t: int) -> tuple[Tensor, 
         rollout.obs[name][t] = part  # the first and only copy: env to device, dtype kept
     if rollout.ground_truth is not None:
         rollout.ground_truth[t] = play.ground_truth
-    policy, rollout.values[t], live, stored = agent.act(
+    actions, rollout.log_probs[t], rollout.values[t], live, stored = agent.choose(
         {name: part[t] for name, part in rollout.obs.items()}, play.live
     )
+    rollout.actions[t] = actions
     agent.memory.store(rollout.memory, t, stored)
-    actions = draw(policy)  # (N, A)
-    rollout.actions[t], rollout.log_probs[t] = actions, log_probs_of(policy, actions)
     return actions, live
 
 
@@ -1252,8 +1267,68 @@ def final_numbers(infos: dict, lanes: np.ndarray) -> Iterator[tuple[str, np.ndar
                 yield name, which, found
 
 
+class Graphed:
+    """A function on a GPU, recorded as a CUDA graph and replayed: one launch instead of hundreds.
+
+    Its inputs are nested tuples and dicts. The tensors among them are copied to where the recording reads them; their
+    shapes, and whatever is no tensor, are part of it. A few calls in a row that agree in these run as they are, the
+    next one is recorded; from then on such calls are replayed, and others run as they are. A replay overwrites what the
+    one before returned.
+    """
+
+    def __init__(self, function: Callable, warm_up: int = 3):
+        self.function, self.warm_up, self.stream = function, warm_up, torch.cuda.Stream()
+        self.graph, self.like, self.calls = None, None, 0
+
+    def __call__(self, *inputs: Any) -> Any:
+        """Call the function, in one of these ways."""
+        like = each_leaf(lambda leaf: leaf.shape if isinstance(leaf, Tensor) else leaf, inputs)
+        if like != self.like:
+            if self.graph is not None:
+                return self.function(*inputs)
+            self.like, self.calls = like, 0
+        self.calls += 1
+        if self.calls <= self.warm_up:
+            return self.run_aside(*inputs)
+        if self.graph is None:
+            self.inputs = each_leaf(lambda leaf: leaf.clone() if isinstance(leaf, Tensor) else leaf, inputs)
+            self.graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self.graph):
+                self.outputs = self.function(*self.inputs)
+        for kept, given in zip(tensors_in(self.inputs), tensors_in(inputs), strict=True):
+            if kept is not given:
+                kept.copy_(given)
+        self.graph.replay()
+        return self.outputs
+
+    def run_aside(self, *inputs: Any) -> Any:
+        """Call the function on a stream of its own, as what is to be recorded has to be run before."""
+        self.stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(self.stream):
+            outputs = self.function(*inputs)
+        torch.cuda.current_stream().wait_stream(self.stream)
+        return outputs
+
+
+def each_leaf(function: Callable, x: Any) -> Any:
+    """Apply the function to what nested tuples and dicts hold; return the results, nested in the same way."""
+    if isinstance(x, dict):
+        return {name: each_leaf(function, part) for name, part in x.items()}
+    if not isinstance(x, tuple):
+        return function(x)
+    parts = [each_leaf(function, part) for part in x]
+    return type(x)(*parts) if hasattr(x, "_fields") else tuple(parts)  # a NamedTuple, or a plain one
+
+
+def tensors_in(x: Any) -> list[Tensor]:
+    """Return the tensors in nested tuples and dicts, in order."""
+    found = []
+    each_leaf(found.append, x)
+    return [leaf for leaf in found if isinstance(leaf, Tensor)]
+
+
 def minibatch_loss(
-    agent: Agent, rollout: Rollout, targets: tuple[Tensor, Tensor], pieces: Pieces, ent_coef: float, args: Args
+    agent: Agent, rollout: Rollout, targets: tuple[Tensor, Tensor], pieces: Pieces, ent_coef: Tensor, args: Args
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the total loss (5.7) of the pieces' steps and the numbers to log; targets: advantages, returns (T, N)."""
     device = rollout.values.device
@@ -1303,10 +1378,33 @@ def policy_numbers(log_ratio: Tensor, args: Args) -> dict[str, Tensor]:
     }
 
 
+def descend(
+    agent: Agent,
+    optimizer: torch.optim.Optimizer,
+    rollout: Rollout,
+    args: Args,
+    first: Tensor,
+    lengths: tuple[int, ...],
+    targets: tuple[Tensor, Tensor],
+    ent_coef: Tensor,
+) -> dict[str, Tensor]:
+    """Take a gradient step on the pieces with these first steps (S,) and lengths; return the numbers to log."""
+    pieces = Pieces(first, torch.tensor(lengths), rollout.values.shape[1])
+    loss, log = minibatch_loss(agent, rollout, targets, pieces, ent_coef, args)
+    optimizer.zero_grad()
+    loss.backward()
+    log["losses/grad_norm"] = clip_gradients(agent, args)
+    optimizer.step()
+    return log
+
+
 def update(
-    agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, last_value: Tensor, ent_coef: float, args: Args
+    agent: Agent, learn: Callable, rollout: Rollout, last_value: Tensor, ent_coef: float, args: Args
 ) -> dict[str, float]:
-    """Learn from the rollout for some epochs; return what to log, averaged over the minibatches."""
+    """Learn from the rollout for some epochs; return what to log, averaged over the minibatches.
+
+    learn is `descend` with the arguments that never change.
+    """
     advantages = gae(
         rewards=rollout.rewards,
         values=rollout.values,
@@ -1319,14 +1417,11 @@ def update(
     )
     returns = advantages + rollout.values
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
-    logs = []
+    targets, ent_coef, logs = (advantages, returns), torch.tensor(ent_coef, device=advantages.device), []
     for _ in range(args.update_epochs):
         for minibatch in pieces.minibatches(args.num_minibatches):
-            loss, log = minibatch_loss(agent, rollout, (advantages, returns), minibatch, ent_coef, args)
-            optimizer.zero_grad()
-            loss.backward()
-            log["losses/grad_norm"] = clip_gradients(agent, args)
-            optimizer.step()
+            first, lengths = minibatch.first.to(advantages.device), tuple(minibatch.length.tolist())
+            log = learn(first, lengths, targets, ent_coef)
             logs.append(torch.stack([*log.values()]))
         epoch = logs[-args.num_minibatches :]
         if args.target_kl is not None and named_means(log, epoch)["losses/approx_kl"] > args.target_kl:
@@ -1406,6 +1501,7 @@ class Run:
     eval_envs: gym.vector.VectorEnv | None
     agent: Agent
     optimizer: torch.optim.Optimizer
+    learn: Callable  # takes a gradient step, see `update`
     rollout: Rollout
     play: Play
     recorder: LaneRecorder | None
@@ -1422,6 +1518,8 @@ def setup(args: Args) -> Run:
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
     device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
+    if args.cuda_graphs and device.type != "cuda":
+        raise ValueError("--cuda-graphs needs a GPU; leave it out")
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")  # TF32
     with enough_memory(args, device):
@@ -1439,13 +1537,26 @@ def setup(args: Args) -> Run:
         load_weights(agent, args.load_model)
     if args.compile:
         compile_layers(agent, obs)
-    optimizer = torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)
+    optimizer, learn = make_learner(agent, rollout, args)
 
     folder = new_folder(args)
     recorder = LaneRecorder(envs, os.path.join(folder, "videos")) if args.capture_video else None
     if args.track:
         start_tracking(args, os.path.basename(folder))
-    return Run(envs, eval_envs, agent, optimizer, rollout, play, recorder, folder, open_writer(args, folder))
+    return Run(envs, eval_envs, agent, optimizer, learn, rollout, play, recorder, folder, open_writer(args, folder))
+
+
+def make_learner(agent: Agent, rollout: Rollout, args: Args) -> tuple[torch.optim.Optimizer, Callable]:
+    """Return the optimizer, and what takes a gradient step with it, see `update`.
+
+    With --cuda-graphs, such steps and those of playing will be recorded.
+    """
+    lr = torch.tensor(args.init_lr, device=rollout.values.device)  # as a number, a CUDA graph would keep it
+    optimizer = torch.optim.AdamW(agent.parameters(), lr=lr, fused=True, capturable=args.cuda_graphs)
+    learn = partial(descend, agent, optimizer, rollout, args)
+    if args.cuda_graphs:
+        agent.choose, learn = Graphed(agent.choose), Graphed(learn)
+    return optimizer, learn
 
 
 @contextlib.contextmanager
@@ -1545,9 +1656,9 @@ def iterate(args: Args, run: Run, step: int) -> tuple[dict[str, float], dict[str
     """Play a rollout from this step of the training on, learn from it; return what to log, and the ended episodes."""
     lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
     ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
-    run.optimizer.param_groups[0]["lr"] = lr
+    run.optimizer.param_groups[0]["lr"].fill_(lr)
     last_value, episodes = collect(run.agent, run.envs, run.play, run.rollout, args, run.recorder)
-    scalars = update(run.agent, run.optimizer, run.rollout, last_value, ent_coef, args)
+    scalars = update(run.agent, run.learn, run.rollout, last_value, ent_coef, args)
     scalars |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
     return scalars | {name: float(np.mean(values)) for name, values in episodes.items()}, episodes
 

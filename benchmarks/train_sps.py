@@ -58,7 +58,7 @@ def script_iteration(script, args, run) -> Callable[[], None]:
 
     def iteration() -> None:
         last_value, _ = script.collect(run.agent, run.envs, run.play, run.rollout, args, None)
-        script.update(run.agent, run.optimizer, run.rollout, last_value, args.init_ent_coef, args)
+        script.update(run.agent, run.learn, run.rollout, last_value, args.init_ent_coef, args)
 
     return iteration
 

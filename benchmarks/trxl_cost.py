@@ -63,7 +63,7 @@ def shares(config: Config) -> None:
     args = ppo_trxl.Args(env_id=config.env_id, num_steps=config.num_steps)
     run = ppo_trxl.setup(args)
     last_value, _ = ppo_trxl.collect(run.agent, run.envs, run.play, run.rollout, args, None)
-    ppo_trxl.update(run.agent, run.optimizer, run.rollout, last_value, 0.0, args)
+    ppo_trxl.update(run.agent, run.learn, run.rollout, last_value, 0.0, args)
     resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6  # kilobytes on Linux
     live, stored = run.play.live, run.rollout.memory
     rows = {

@@ -36,6 +36,7 @@ CASES = {
     "--seed 99999999999999999999": "--seed is 99999999999999999999; it must be 0 or more",
     "--exp-name ../up": "--exp-name is '../up'; it must be a name without slashes",
     "--env-id CueRecall-v0 --capture-video": "CueRecall-v0 cannot be made: .*render_mode",
+    "--no-cuda --cuda-graphs": "--cuda-graphs needs a GPU; leave it out",
     "--load-model missing.pt": "there is no file missing.pt; --save-model writes model.pt",
 }
 
@@ -71,6 +72,11 @@ def test_setup_names_the_fault(line):
 def test_setup_names_the_transformer_s_fault(line):
     message = setup_error(ppo_trxl.tyro.cli(ppo_trxl.Args, args=line.split()), ppo_trxl)
     assert re.search(TRANSFORMER_CASES[line], message), message
+
+
+def test_a_learned_encoding_is_not_recorded():
+    with pytest.raises(ValueError, match=r"--cuda-graphs cannot .* learned .* use another encoding"):
+        ppo_trxl.Memory(ppo_trxl.Args(cuda_graphs=True, trxl_positional_encoding="learned"))
 
 
 @pytest.mark.parametrize("line", ["--env-id MortarMayhm-v0", '--env-options {"arena_size":9}', "--num-minibatches 64"])

@@ -10,6 +10,8 @@ import torch
 from conftest import SMALL
 from gymnasium.vector import AutoresetMode
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 import ppo_gru
 import ppo_trxl
@@ -180,7 +182,7 @@ def test_the_encoder_sees_each_step_once_an_epoch_and_no_padding(played, monkeyp
     for way in ("recur", "scan"):
         unroll = getattr(run.agent.memory, way)
         monkeypatch.setattr(run.agent.memory, way, lambda *given, unroll=unroll: (runs.append(1), unroll(*given))[1])
-    ppo_gru.update(run.agent, run.optimizer, run.rollout, last_value, 0.0, args)
+    ppo_gru.update(run.agent, run.learn, run.rollout, last_value, 0.0, args)
     assert sum(rows) == args.update_epochs * args.num_envs * args.num_steps
     assert len(runs) == args.update_epochs * args.num_minibatches, "all pieces of a minibatch at once"
     rows.clear()
@@ -273,7 +275,7 @@ def test_update_hands_the_rollout_to_gae(played, monkeypatch):
     seen = {}
     gae = ppo_gru.gae
     monkeypatch.setattr(ppo_gru, "gae", lambda **given: (seen.update(given), gae(**given))[1])
-    ppo_gru.update(run.agent, run.optimizer, run.rollout, last_value, 0.0, args)
+    ppo_gru.update(run.agent, run.learn, run.rollout, last_value, 0.0, args)
     names = ("rewards", "values", "terminated", "truncated", "truncation_values")
     assert all(seen[name] is getattr(run.rollout, name) for name in names)
     assert (seen["last_value"] is last_value, seen["gamma"], seen["gae_lambda"]) == (True, 0.9, 0.8)
@@ -327,29 +329,47 @@ def test_packed_or_padded_is_the_same(played):
 
 def moved(part, device):
     """A copy on the device of what is on a GPU when there is one."""
-    if isinstance(part, torch.Tensor):
-        return part.to(device)
-    if isinstance(part, dict):
-        return {name: moved(each, device) for name, each in part.items()}
-    if isinstance(part, ppo_trxl.Timeline):
-        return ppo_trxl.Timeline(part.items.to(device), part.steps.to(device))
-    return part
+
+    def move(leaf):
+        if isinstance(leaf, ppo_trxl.Timeline):
+            return ppo_trxl.Timeline(leaf.items.to(device), leaf.steps.to(device))
+        return leaf.to(device) if isinstance(leaf, torch.Tensor) else leaf
+
+    return ppo_gru.each_leaf(move, part)
+
+
+class OneDevice(TorchDispatchMode):
+    """Fails where numbers go from the CPU to another device or back."""
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        found = operation(*args, **(kwargs or {}))
+        devices = {x.device.type for x in tree_leaves((args, kwargs, found)) if isinstance(x, torch.Tensor)}
+        assert len(devices) < 2, f"{operation} is given or returns tensors of {devices}"
+        return found
 
 
 @pytest.mark.parametrize("memory", MEMORIES)
-def test_the_update_waits_for_no_device(played, monkeypatch, memory):
-    """On the meta device, which has shapes and no numbers: whatever asked it for one would fail, as would a mixture."""
+def test_playing_and_learning_wait_for_no_device(played, monkeypatch, memory):
+    """On the meta device, which has shapes and no numbers: whatever asked it for one would fail, as would a mixture.
+
+    Nothing is copied to it either, except where the pieces' lengths differ from minibatch to minibatch.
+    """
     heads = {"reconstruction_coef": 0.1, "ground_truth_coef": 0.1}
-    args, run, *_ = played(env_id="MortarMayhemB-Grid-v0", iterations=2, **heads, **memory)
     script = memory.get("script", ppo_gru)
+    args, run, *_ = played(env_id="MortarMayhemB-Grid-v0", iterations=2, **heads, **memory)
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())  # knows no such device
     pieces = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated)
     agent = run.agent.to("meta")
-    parts = {name: moved(part, "meta") for name, part in vars(run.rollout).items() if name != "alike"}
-    rollout = script.Rollout(**parts, alike=None)
-    targets = 2 * (torch.zeros(16, 4, device="meta"),)
+    rollout = script.Rollout(**moved(vars(run.rollout) | {"alike": None}, "meta"))
+    live, obs = moved(run.play.live, "meta"), {name: part[0] for name, part in rollout.obs.items()}
+    if memory.get("trxl_positional_encoding") != "learned":  # it asks whether its table goes on
+        with OneDevice(), torch.no_grad():
+            agent.choose(obs, live)
+    targets, ent_coef = 2 * (torch.zeros(16, 4, device="meta"),), torch.ones((), device="meta")
+    optimizer = torch.optim.SGD(agent.parameters())
     for minibatch in pieces.minibatches(2):
-        loss, _ = script.minibatch_loss(agent, rollout, targets, minibatch, 0.1, args)
-        loss.backward()
-        nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+        first, lengths = minibatch.first.to("meta"), tuple(minibatch.length.tolist())
+        with OneDevice() if minibatch.even() else contextlib.nullcontext():
+            script.descend(agent, optimizer, rollout, args, first, lengths, targets, ent_coef)
+    assert minibatch.even() == (memory not in RECURRENT and "trxl_segment_length" not in memory)  # 16 is no 3 x 5
     assert all(parameter.grad.device.type == "meta" for parameter in agent.parameters())

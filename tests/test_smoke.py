@@ -1,5 +1,6 @@
 """A short training of each kind, through `main` and through the command line."""
 
+import functools
 import glob
 import math
 import os
@@ -219,7 +220,8 @@ def test_target_kl_ends_the_epochs(played, monkeypatch):
     steps = []
     optimizer = torch.optim.SGD(run.agent.parameters(), lr=1.0)
     monkeypatch.setattr(optimizer, "step", lambda step=optimizer.step: (steps.append(1), step()))
-    ppo_gru.update(run.agent, optimizer, run.rollout, last_value, 0.0, args)
+    learn = functools.partial(ppo_gru.descend, run.agent, optimizer, run.rollout, args)
+    ppo_gru.update(run.agent, learn, run.rollout, last_value, 0.0, args)
     assert len(steps) == args.num_minibatches
 
 
