@@ -321,7 +321,7 @@ def load(path: str, config: Config) -> tuple[ModuleType, Any]:
         script = SCRIPTS[torch.load(path, map_location="cpu", weights_only=True)["script"]]
     args, _ = script.load_model(path)
     settings = {"eval_levels": config.levels, "eval_repeats": config.repeats, "eval_max_steps": config.max_steps}
-    return script, replace(args, cuda=config.cuda, **settings)
+    return script, replace(args, cuda=config.cuda, cuda_graphs=False, **settings)
 
 
 def play(path: str, script: ModuleType, args: Any, seed: int) -> dict[str, np.ndarray]:

@@ -523,10 +523,11 @@ class Pieces:
     def minibatches(self, count: int) -> Iterator["Pieces"]:
         """Shuffle the pieces and deal them, whole, into count minibatches of nearly the same number of steps."""
         order = torch.randperm(len(self.first))
-        first, length = self.first[order], self.length[order]
+        first, length = self.first[order.to(self.first.device)], self.length[order]
         share = (length.cumsum(0) - length) * count // length.sum()  # (S,) the minibatch that a piece goes to
-        for i in range(count):
-            yield Pieces(first[share == i], length[share == i], self.lanes)
+        sizes = share.bincount(minlength=count).tolist()
+        for mb_first, mb_length in zip(first.split(sizes), length.split(sizes), strict=True):
+            yield Pieces(mb_first, mb_length, self.lanes)
 
 
 # ---- 4 ENCODERS AND HEADS ----
@@ -910,7 +911,9 @@ class Memory(nn.Module):
         return rows, age[None], visible(age, live.steps[:, None], self.window)[:, None]
 
     def reset(self, live: Live, done: Tensor) -> Live:
-        """Forget the lanes whose episode ended, where done (N,) is true."""
+        """Forget the lanes whose episode ended, where done (N,), on the CPU, is true."""
+        if not done.any():
+            return live
         rows, _, _ = self.look_back(live)
         lanes = done.nonzero().to(live.steps.device)  # (lanes that end, 1)
         for cache in (live.keys, live.values):
@@ -1097,7 +1100,8 @@ def load_model(path: str) -> tuple[Args, dict[str, Tensor]]:
 def load_weights(agent: Agent, path: str) -> None:
     """Give the agent the weights in the file; auxiliary heads may be added to it or left out.
 
-    Raises ValueError if they belong to another network or the file holds none, OSError if it cannot be read.
+    Raises ValueError if they belong to another network, are no numbers or there are none, OSError if the file cannot be
+    read.
     """
     saved_args, weights = load_model(path)
     try:
@@ -1109,6 +1113,8 @@ def load_weights(agent: Agent, path: str) -> None:
         shaping += ("frame_stack", "step_encoding", "vector_frequencies")
         flags = [f"{flag(name)} {getattr(saved_args, name)}" for name in shaping]
         raise ValueError(f"{path} holds the weights of another network, trained with {' '.join(flags)}") from None
+    if not all(weight.isfinite().all() for weight in weights.values()):
+        raise ValueError(f"{path} holds weights that are no finite numbers: the training diverged")
 
 
 # ---- 7 TRAINING ----
@@ -1304,10 +1310,11 @@ class Graphed:
     def run_aside(self, *inputs: Any) -> Any:
         """Call the function on a stream of its own, as what is to be recorded has to be run before."""
         self.stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(self.stream):
-            outputs = self.function(*inputs)
-        torch.cuda.current_stream().wait_stream(self.stream)
-        return outputs
+        try:
+            with torch.cuda.stream(self.stream):
+                return self.function(*inputs)
+        finally:
+            torch.cuda.current_stream().wait_stream(self.stream)
 
 
 def each_leaf(function: Callable, x: Any) -> Any:
@@ -1417,11 +1424,11 @@ def update(
     )
     returns = advantages + rollout.values
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
+    pieces.first = pieces.first.to(advantages.device)
     targets, ent_coef, logs = (advantages, returns), torch.tensor(ent_coef, device=advantages.device), []
     for _ in range(args.update_epochs):
         for minibatch in pieces.minibatches(args.num_minibatches):
-            first, lengths = minibatch.first.to(advantages.device), tuple(minibatch.length.tolist())
-            log = learn(first, lengths, targets, ent_coef)
+            log = learn(minibatch.first, tuple(minibatch.length.tolist()), targets, ent_coef)
             logs.append(torch.stack([*log.values()]))
         epoch = logs[-args.num_minibatches :]
         if args.target_kl is not None and named_means(log, epoch)["losses/approx_kl"] > args.target_kl:
@@ -1554,9 +1561,15 @@ def make_learner(agent: Agent, rollout: Rollout, args: Args) -> tuple[torch.opti
     lr = torch.tensor(args.init_lr, device=rollout.values.device)  # as a number, a CUDA graph would keep it
     optimizer = torch.optim.AdamW(agent.parameters(), lr=lr, fused=True, capturable=args.cuda_graphs)
     learn = partial(descend, agent, optimizer, rollout, args)
-    if args.cuda_graphs:
-        agent.choose, learn = Graphed(agent.choose), Graphed(learn)
-    return optimizer, learn
+    if not args.cuda_graphs:
+        return optimizer, learn
+    agent.choose, recorded = Graphed(agent.choose), Graphed(learn)
+
+    def learn_from(first: Tensor, lengths: tuple[int, ...], *rest: Any) -> dict[str, Tensor]:
+        # The padding of uneven pieces is told by numbers from the CPU, which cannot be copied in a recording.
+        return (recorded if len(set(lengths)) == 1 else learn)(first, lengths, *rest)
+
+    return optimizer, learn_from
 
 
 @contextlib.contextmanager
@@ -1616,7 +1629,7 @@ def start_tracking(args: Args, name: str) -> None:
 def train(args: Args, run: Run) -> str:
     """Train for --total-timesteps, rounded down to whole iterations, or until Ctrl-C; return the run folder.
 
-    Whatever ends it, what was learned is kept. Raises MemoryLimit.
+    Whatever ends it, what was learned is kept. Raises what `iterate` raises.
     """
     recent = {"return": deque(maxlen=100), "length": deque(maxlen=100)}
     batch_size = args.num_envs * args.num_steps
@@ -1653,12 +1666,17 @@ def train(args: Args, run: Run) -> str:
 
 
 def iterate(args: Args, run: Run, step: int) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """Play a rollout from this step of the training on, learn from it; return what to log, and the ended episodes."""
+    """Play a rollout from this step of the training on, learn from it; return what to log, and the ended episodes.
+
+    Raises FloatingPointError if the training diverged, MemoryLimit as the memory does.
+    """
     lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
     ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
     run.optimizer.param_groups[0]["lr"].fill_(lr)
     last_value, episodes = collect(run.agent, run.envs, run.play, run.rollout, args, run.recorder)
     scalars = update(run.agent, run.learn, run.rollout, last_value, ent_coef, args)
+    if not math.isfinite(scalars["losses/grad_norm"]):
+        raise FloatingPointError("the training diverged: its gradient is no finite number; try a lower --init-lr")
     scalars |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
     return scalars | {name: float(np.mean(values)) for name, values in episodes.items()}, episodes
 
@@ -1695,5 +1713,5 @@ if __name__ == "__main__":
         sys.exit(one_line(error))
     try:
         train(args, run)
-    except MemoryLimit as error:
+    except (MemoryLimit, FloatingPointError) as error:
         sys.exit(one_line(error))

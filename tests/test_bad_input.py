@@ -1,5 +1,6 @@
 """Bad input ends in one line that says what is wrong and what would be right, and writes nothing."""
 
+import glob
 import os
 import re
 import subprocess
@@ -56,9 +57,10 @@ def run(flags, cwd):
 
 
 def setup_error(args, script=ppo_gru):
+    before = os.path.exists("runs") and os.listdir("runs")
     with pytest.raises((ValueError, OSError, ImportError, script.gym.error.Error)) as error:
         script.setup(args)
-    assert not os.path.exists("runs"), "nothing half-written"
+    assert (os.path.exists("runs") and os.listdir("runs")) == before, "nothing half-written"
     return str(error.value)
 
 
@@ -178,6 +180,15 @@ def test_an_episode_that_outlasts_a_learned_encoding(tmp_path):
     assert last.startswith("ppo_trxl.py: --trxl-pe-length is 40, but an episode is longer; make it"), done.stderr
     assert "Traceback" not in done.stderr
     assert len(list(tmp_path.glob("runs/*/model.pt"))) == 1
+
+
+@pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
+def test_a_training_that_diverges(tiny, script):
+    with pytest.raises(FloatingPointError, match=r"the training diverged: .*; try a lower --init-lr"):
+        script.main(tiny(script, env_id="CueRecall-v0", init_lr=1e30, total_timesteps=640, save_model=True))
+    (path,) = glob.glob("runs/*/model.pt")
+    message = setup_error(tiny(script, env_id="CueRecall-v0", load_model=path), script)
+    assert message == f"{path} holds weights that are no finite numbers: the training diverged"
 
 
 def test_a_compiler_that_is_missing(tiny, monkeypatch):

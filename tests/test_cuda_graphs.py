@@ -56,7 +56,7 @@ def test_replays_do_what_the_functions_do(as_on_a_gpu, monkeypatch, memory, task
     plain = train(*as_on_a_gpu(**memory, **task))
     script, args, run = as_on_a_gpu(**memory, **task)
     graphs = recorded.install(monkeypatch)
-    run.agent.choose, run.learn = script.Graphed(run.agent.choose), script.Graphed(run.learn)
+    run.optimizer, run.learn = script.make_learner(run.agent, run.rollout, args)
     replayed = train(script, args, run)
     for name in plain:
         np.testing.assert_array_equal(replayed[name], plain[name], err_msg=name)
@@ -65,11 +65,28 @@ def test_replays_do_what_the_functions_do(as_on_a_gpu, monkeypatch, memory, task
     assert [graph.replays for graph in graphs] == ([steps - 3, minibatches - 3] if fixed else [steps - 3])
 
 
+def test_uneven_pieces_are_not_recorded(as_on_a_gpu, monkeypatch):
+    """Not even if they are the same again and again: how they are padded would be copied from the CPU."""
+    script, args, run = as_on_a_gpu(ppo_trxl, env_id="CueRecall-v0", trxl_segment_length=5, num_minibatches=1)
+    graphs = recorded.install(monkeypatch)
+    _, learn = script.make_learner(run.agent, run.rollout, args)
+    pieces = run.agent.memory.cut(torch.zeros(16, 4, dtype=torch.bool))
+    lengths, targets = tuple(pieces.length.tolist()), (torch.zeros(16, 4), torch.zeros(16, 4))
+    assert set(lengths) == {5, 1}
+    for _ in range(6):
+        learn(pieces.first, lengths, targets, torch.tensor(0.0))
+    assert not graphs
+    even = pieces.length == 5
+    for _ in range(6):
+        learn(pieces.first[even], int(even.sum()) * (5,), targets, torch.tensor(0.0))
+    assert graphs[0].replays == 3
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("memory", MEMORIES)
 @pytest.mark.parametrize("task", TASKS)
 def test_a_gpu_records_and_replays(tiny, scalars, memory, task):
-    """The draws differ from those without graphs; what is learned from must be what was played all the same."""
+    """What is learned from is what was played, and nothing else."""
     changes = {"cuda": True, "cuda_graphs": True, "total_timesteps": 512}
     curves = scalars(memory.get("script", ppo_gru).main(tiny(**changes, **memory, **task)))
     assert all(error < 5e-2 for error in curves["losses/ratio_error"])
