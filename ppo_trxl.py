@@ -830,11 +830,9 @@ class Memory(nn.Module):
         self.blocks = nn.ModuleList(Block(args) for _ in range(args.trxl_num_layers))
         for block in self.blocks:
             block_init(block, args.trxl_init, args.trxl_num_layers)
-        if self.encoding == "learned" and args.cuda_graphs:
-            raise ValueError(
-                "--cuda-graphs cannot watch for the end of a learned encoding's table; use another encoding"
-            )
         if self.encoding == "learned":
+            if args.cuda_graphs:
+                raise ValueError("--cuda-graphs cannot watch for the end of a learned encoding; use another one")
             rows = args.trxl_pe_length + 1  # one for what follows an episode's last step, which may be valued
             self.table = nn.Parameter(torch.randn(rows, self.width) / math.sqrt(self.width))
 

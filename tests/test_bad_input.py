@@ -77,7 +77,7 @@ def test_setup_names_the_transformer_s_fault(line):
 
 
 def test_a_learned_encoding_is_not_recorded():
-    with pytest.raises(ValueError, match=r"--cuda-graphs cannot .* learned .* use another encoding"):
+    with pytest.raises(ValueError, match=r"--cuda-graphs cannot .* learned .* use another one"):
         ppo_trxl.Memory(ppo_trxl.Args(cuda_graphs=True, trxl_positional_encoding="learned"))
 
 
