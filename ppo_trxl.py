@@ -479,7 +479,7 @@ def first_alike(obs: dict[str, Tensor]) -> Tensor:
 class Pieces:
     """Runs of consecutive steps of one lane each. Step t of lane n has the flat index t * N + n."""
 
-    first: Tensor  # (S,) flat index of each piece's first step
+    first: Tensor  # (S,) flat index of each piece's first step, on the rollout's device once it is learned from
     length: Tensor  # (S,) steps of each piece, on the CPU, as shapes depend on it
     lanes: int  # N
 
@@ -572,7 +572,7 @@ def rounded_up(x: Tensor, multiple: int = 16) -> Tensor:
 
     It compiles these kernels for every number of rows that it meets, which can take longer than running them.
     """
-    if not torch.is_autocast_enabled("cpu") or x.device.type != "cpu":
+    if not torch.is_autocast_enabled("cpu"):
         return x
     return F.pad(x, (*(x.dim() - 1) * (0, 0), 0, -len(x) % multiple))
 
@@ -926,7 +926,7 @@ class Memory(nn.Module):
 
     def unroll(self, x: Tensor, pieces: Pieces, stored: Timeline) -> Tensor:
         """Run whole segments at once: x (R, D) to (R, D), with the items of the W steps before each segment."""
-        first, last = pieces.first.to(x.device)[:, None], len(stored.steps) - 1
+        first, last = pieces.first[:, None], len(stored.steps) - 1
         row, lane = self.window + first // pieces.lanes, first % pieces.lanes  # (S, 1)
         x = pieces.pad(x)  # (S, L, D)
         at = pieces.places(x.device)  # (L,)
@@ -1337,7 +1337,7 @@ def minibatch_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the total loss (5.7) of the pieces' steps and the numbers to log; targets: advantages, returns (T, N)."""
     device = rollout.values.device
-    steps = pieces.steps().to(device)  # (R,)
+    steps = pieces.steps()  # (R,)
     distinct, which = steps, None
     if rollout.alike is not None:
         distinct, which = rollout.alike[steps].unique(return_inverse=True)  # equals are encoded once
