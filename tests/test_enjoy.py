@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -164,6 +165,21 @@ def test_text_in_the_data_cannot_end_the_script():
     page = enjoy.page(enjoy.page_data(episode, "CartPole-v1", {"</script>": "<!--"}), "")
     assert page.count("</script>") == 3
     assert data_of(page)["facts"] == {"</script>": "<!--"}
+
+
+def test_the_page_is_installed_with_the_module(tmp_path):
+    """From a wheel, not only in a checkout; building it writes nothing to the checkout."""
+    site = str(tmp_path / "site")
+    offline = ["--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check"]
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", *offline, "--target", site]
+    subprocess.run([*pip, Path(__file__).parents[1]], check=True)
+    code = "import enjoy; print(enjoy.__file__); print(enjoy.page({'title': 'CartPole-v1'}, ''))"
+    environ = {**os.environ, "PYTHONPATH": site}
+    made = subprocess.run([sys.executable, "-c", code], env=environ, capture_output=True, text=True, check=True)
+    file, page = made.stdout.split("\n", 1)
+    assert file == os.path.join(site, "enjoy.py")
+    assert page.rstrip() == enjoy.page({"title": "CartPole-v1"}, "").rstrip()
+    assert data_of(page) == {"title": "CartPole-v1"}
 
 
 def test_a_thousand_steps_stay_small(saved):
