@@ -5,6 +5,8 @@ import contextlib
 import importlib
 import inspect
 import io
+import itertools
+import json
 import os
 import re
 import shlex
@@ -15,9 +17,11 @@ from pathlib import Path
 from types import ModuleType
 from unittest.mock import patch
 
+import gymnasium as gym
 import pytest
 import tyro
 
+import memory_gym_envs  # noqa: F401 (registers the ids)
 import ppo_gru
 import ppo_trxl
 
@@ -180,6 +184,18 @@ def test_command(page, command):
     assert words[0] == "-m" or (ROOT / path).exists()
     wrong = error(parser(import_program(path)), arguments)
     assert wrong is None, f"{page}: {command}\n{wrong}"
+
+
+OPTIONS = sorted({call for _, call in COMMANDS.values() if "--env-options" in call})
+
+
+@pytest.mark.parametrize("command", OPTIONS, ids=range(len(OPTIONS)))
+def test_options_exist(command):
+    words = shlex.split(command)
+    given = dict(itertools.pairwise(words))
+    options = json.loads(given["--env-options"])
+    _, info = gym.make(given.get("--env-id", ppo_gru.Args.env_id)).reset(seed=1, options=options)
+    assert "ground_truth" in info
 
 
 @each_flag
