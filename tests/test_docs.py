@@ -1,0 +1,229 @@
+"""What the README and docs/ name exists, and their commands are commands that the programs take."""
+
+import argparse
+import contextlib
+import importlib
+import inspect
+import io
+import itertools
+import json
+import os
+import re
+import shlex
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from unittest.mock import patch
+
+import gymnasium as gym
+import pytest
+import tyro
+
+import memory_gym_envs  # noqa: F401 (registers the ids)
+import ppo_gru
+import ppo_trxl
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+DOCS = sorted((ROOT / "docs").glob("*.md"))
+PAGES = [README, *DOCS]
+SCRIPTS = (ppo_gru, ppo_trxl)
+PROGRAMS = [*ROOT.glob("*.py"), *(ROOT / "benchmarks").glob("*.py")]
+
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+
+
+class Parsed(Exception):
+    """A program's command line was parsed, and the program need not run."""
+
+
+def code(page: Path) -> list[str]:
+    """Return a page's lines of fenced code, and its code spans."""
+    text = page.read_text().replace("\\\n", " ")
+    fence = re.compile(r"^```\w*\n(.*?)^```", re.MULTILINE | re.DOTALL)
+    lines = [line for block in fence.findall(text) for line in block.splitlines()]
+    spans = re.findall(r"`((?:[^`\n]|\n(?!\n))+)`", fence.sub("", text))
+    return lines + [" ".join(span.split()).replace("\\|", "|") for span in spans]
+
+
+def commands(page: Path) -> list[str]:
+    """Return the page's calls of Python programs, without what the shell does with them."""
+    calls = [part.split(" > ")[0].strip() for text in code(page) for part in text.split(" && ")]
+    return sorted({call for call in calls if call.startswith("python ")})
+
+
+COMMANDS = {f"{page.stem}-{i}": (page.name, call) for page in PAGES for i, call in enumerate(commands(page))}
+FLAGS = {text: page.name for page in PAGES for text in code(page) if text.startswith("--")}
+each_command = pytest.mark.parametrize(("page", "command"), COMMANDS.values(), ids=COMMANDS)
+each_flag = pytest.mark.parametrize(("flag", "page"), FLAGS.items(), ids=FLAGS)
+
+
+def parser(module: ModuleType) -> Callable[[list[str]], object]:
+    """Return the function that parses a program's arguments; SystemExit is what it raises for wrong ones."""
+    if hasattr(module, "Args"):
+        return module.parse_args
+    if hasattr(module, "Config"):
+        return lambda arguments: tyro.cli(module.Config, args=arguments)
+    if hasattr(module, "argparse"):
+        return lambda arguments: parse_with_argparse(module.main, arguments)
+    return parse_without_flags
+
+
+def parse_with_argparse(main: Callable[[], None], arguments: list[str]) -> None:
+    """Run a program up to the point where its arguments are parsed."""
+    parse = argparse.ArgumentParser.parse_args
+
+    def parse_and_stop(self, *args):
+        parse(self, *args)
+        raise Parsed
+
+    with (
+        patch.object(argparse.ArgumentParser, "parse_args", parse_and_stop),
+        patch.object(sys, "argv", ["program", *arguments]),
+        contextlib.suppress(Parsed),
+    ):
+        main()
+        raise AssertionError("the program ran without parsing its arguments")
+
+
+def parse_without_flags(arguments: list[str]) -> None:
+    """Take what a program without a parser takes."""
+    if any(argument.startswith("-") for argument in arguments):
+        raise SystemExit(f"the program has no flags, but is given {arguments}")
+
+
+def error(parse: Callable[[list[str]], object], arguments: list[str]) -> str | None:
+    """Return what a program says of wrong arguments, None for right ones."""
+    output = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
+            parse(arguments)
+    except SystemExit as end:
+        return f"{end.code} {output.getvalue()}"
+    return None
+
+
+def import_program(path: str) -> ModuleType:
+    """Import a program by its path or its module's name, leaving the environment's variables as they are."""
+    with patch.dict(os.environ):
+        return importlib.import_module(Path(path).stem if path.endswith(".py") else path)
+
+
+@cache
+def all_flags() -> set[str]:
+    """Return the flags that the help of any program lists."""
+    found = set()
+    for path in PROGRAMS:
+        source = path.read_text()
+        if "tyro.cli(" in source or "ArgumentParser(" in source:
+            with patch.dict(os.environ, COLUMNS="200"):
+                text = error(parser(import_program(str(path))), ["--help"])
+            for line in re.findall(r"^[\s│]*((?:-\w, )?--\S.*)$", text, re.MULTILINE):
+                found |= set(re.findall(r"(?:^|, )(--[a-z][a-z0-9-]*)", line))
+    return found
+
+
+def slug(heading: str) -> str:
+    """Return the anchor that GitHub gives a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
+def test_readme_is_short():
+    lines = README.read_text().splitlines()
+    assert len(lines) <= 200
+    first = next(line for line in lines if line.startswith("pip install"))
+    assert len(first) <= 220
+    assert "python ppo_gru.py" in first
+
+
+def test_readme_has_the_line_that_ci_runs():
+    pattern = re.search(r"grep -m 1 -o '([^']+)'", (ROOT / ".ci/run").read_text()).group(1)
+    line = re.search(pattern, README.read_text()).group()
+    assert line.strip() == 'pip install -e ".[test]" && pytest -n auto'
+
+
+@each_page
+def test_links(page):
+    text = page.read_text()
+    links = re.findall(r"\]\(([^)\s]+)\)", text)
+    for link in links:
+        if link.startswith("https://"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), link
+        if anchor:
+            assert anchor in [slug(heading) for heading in re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE)]
+
+
+def test_readme_links_every_page():
+    links = re.findall(r"\]\((docs/[^)#]+\.md)", README.read_text())
+    assert set(links) == {f"docs/{page.name}" for page in DOCS}
+
+
+@each_page
+def test_files_exist(page):
+    for text in code(page):
+        for name in re.findall(r"(?<![\w./<-])[\w./-]+\.(?:py|md|toml|yml|cff)\b", text):
+            assert (ROOT / name).exists(), f"{name}, in `{text}`"
+
+
+@each_page
+def test_extras_exist(page):
+    project = (ROOT / "pyproject.toml").read_text().split("[project.optional-dependencies]")[1].split("\n[")[0]
+    extras = set(re.findall(r"^(\w+) = \[", project, re.MULTILINE))
+    assert set(re.findall(r"\.\[(\w+)\]", page.read_text())) <= extras
+
+
+@each_command
+def test_command(page, command):
+    _, *words = shlex.split(command)
+    path, *arguments = words[1:] if words[0] == "-m" else words
+    assert words[0] == "-m" or (ROOT / path).exists()
+    wrong = error(parser(import_program(path)), arguments)
+    assert wrong is None, f"{page}: {command}\n{wrong}"
+
+
+OPTIONS = sorted({call for _, call in COMMANDS.values() if "--env-options" in call})
+
+
+@pytest.mark.parametrize("command", OPTIONS, ids=range(len(OPTIONS)))
+def test_options_exist(command):
+    words = shlex.split(command)
+    given = dict(itertools.pairwise(words))
+    options = json.loads(given["--env-options"])
+    _, info = gym.make(given.get("--env-id", ppo_gru.Args.env_id)).reset(seed=1, options=options)
+    assert "ground_truth" in info
+
+
+@each_flag
+def test_flag_exists(page, flag):
+    assert set(re.findall(r"(?:^|\s)(--[a-z][a-z0-9-]*)", flag)) <= all_flags(), page
+
+
+@pytest.mark.parametrize("flag", sorted(flag for flag in FLAGS if re.fullmatch(r"--[a-z-]+ [^A-Z|]+", flag)))
+def test_flag_takes_its_value(flag):  # capitals stand for a value, and bars divide the values that there are
+    wrong = [error(script.parse_args, shlex.split(flag)) for script in SCRIPTS]
+    assert None in wrong, wrong
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.__name__)
+def test_readme_names_the_sections(script):
+    named = re.findall(r"^\| (\d [A-Z ]+) \|", README.read_text(), re.MULTILINE)
+    assert named == re.findall(r"^# ---- (.+) ----$", inspect.getsource(script), re.MULTILINE)
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.__name__)
+def test_readme_names_the_memory_interface(script):
+    section = README.read_text().split("## Add your own memory")[1].split("\n## ")[0]
+    methods = re.findall(r"^\| `(\w+)\(([^)]*)\)", section, re.MULTILINE)
+    assert len(methods) >= 5
+    for name, parameters in methods:
+        assert ["self", *parameters.split(", ")] == list(inspect.signature(getattr(script.Memory, name)).parameters)
+
+
+@each_page
+def test_nothing_is_left_open(page):
+    assert "TODO" not in page.read_text()
