@@ -1,11 +1,13 @@
 """Memory Gym's environments, batched: importing this package registers their ids with Gymnasium.
 
-`gym.make(id)` makes one environment, `gym.make_vec(id, num_envs=N)` N of them in one object.
+`gym.make(id)` makes one environment, `gym.make_vec(id, num_envs=N)` N of them in one object, and
+`memory_gym_envs.make_envs(id, N)` N of any Gymnasium id as a training script takes them.
 """
 
 from gymnasium.envs.registration import register
 
 from memory_gym_envs.base import MemoryGymVectorEnv
+from memory_gym_envs.making import final_numbers, final_observations, is_memory_gym, make_envs, parse_options
 from memory_gym_envs.mortar_mayhem import MortarMayhem
 from memory_gym_envs.mystery_path import MysteryPath
 from memory_gym_envs.options import Option, options_table
@@ -20,7 +22,12 @@ __all__ = [
     "MysteryPath",
     "Option",
     "SearingSpotlights",
+    "final_numbers",
+    "final_observations",
+    "is_memory_gym",
+    "make_envs",
     "options_table",
+    "parse_options",
 ]
 
 FAMILIES = (MortarMayhem, MysteryPath, SearingSpotlights)

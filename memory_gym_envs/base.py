@@ -179,18 +179,18 @@ class MemoryGymVectorEnv(VectorEnv):
         infos.update(self._truth_info(None))
         return observations, rewards, terminated, truncated, infos
 
-    def render(self) -> tuple[np.ndarray, ...] | None:
+    def render(self, lanes: np.ndarray | slice = ALL) -> tuple[np.ndarray, ...] | None:
         """One picture per lane: (84, 84, 3), or (336, 336, 3) in the debug mode. None without a render mode."""
         if self.render_mode is None:
             gym.logger.warn("render() needs an environment that was made with render_mode, e.g. 'rgb_array'")
             return None
         if not self.ready:
             raise gym.error.ResetNeeded("call reset() before render()")
-        frames = self.frames(ALL)
+        frames = self.frames(lanes)
         if self.render_mode == "rgb_array":
             return tuple(frames)
         large = [magnify(frame, DEBUG_ZOOM) for frame in frames]
-        for lane, frame in enumerate(large):
+        for lane, frame in zip(np.arange(self.num_envs)[lanes].tolist(), large, strict=True):
             self.annotate(frame, lane)
         return tuple(large)
 

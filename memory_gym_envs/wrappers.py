@@ -1,12 +1,13 @@
-"""Vector wrappers of the thesis' experiments: grayscale frame stacks, the step number, the spotlight perturbation.
+"""Vector wrappers of observations: frame stacks, the step number, the last action, the spotlight perturbation.
 
-They take any vector environment with same-step autoreset. Gymnasium's (1.2 to 1.4) own vector wrappers of observations
-refuse those, and it has no frame stack for vector environments at all.
-Shape letters: N lanes, n some of them, H and W of a picture, K frames of a stack, D width of an encoding.
+They take any vector environment with same-step autoreset. Gymnasium's (1.4) own vector wrappers of observations refuse
+those, and it has no frame stack for vector environments at all.
+Shape letters: N lanes, n some of them, H and W of a picture, K frames of a stack, D width of an encoding, V of a
+vector, A action branches.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 from memory_gym_envs.base import ALL, one_of, overwrite
 from memory_gym_envs.bits import pixels
 from memory_gym_envs.drawing import FRAME, SCREEN
-from memory_gym_envs.options import resolve
+from memory_gym_envs.options import brief, resolve
 from memory_gym_envs.searing_spotlights import (
     SPEED,
     TIME,
@@ -27,7 +28,8 @@ from memory_gym_envs.searing_spotlights import (
     spot_places,
 )
 
-OBSERVATION, STEP_ENCODING = "observation", "step_encoding"  # parts of a Dict that StepEncoding makes
+OBSERVATION = "observation"  # the name of an observation that is no Dict, where it becomes a part of one
+STEP_ENCODING, LAST_ACTION = "step_encoding", "last_action"  # parts of a Dict that the wrappers add
 LUMA = np.array([77, 150, 29], np.float32) / 256  # ITU-R 601, in 256ths so that all sums are exact
 SPOT_STREAM = 2  # keeps the generators of the perturbation apart from those of the environment with the same seed
 HEAD_START = 0.3  # of its way, that a spotlight of the perturbation has gone when an episode begins
@@ -57,8 +59,8 @@ class SameStepWrapper(VectorWrapper):
         """Starts new episodes in the lanes, (n,), with their first observations. seeds: one for every lane of N."""
         raise NotImplementedError
 
-    def advance(self, observations: Any) -> None:
-        """Takes in what all lanes observe after a step, before any reset."""
+    def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
+        """Takes in a step of all lanes and what they observe after it, before any reset."""
         raise NotImplementedError
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
@@ -86,7 +88,7 @@ class SameStepWrapper(VectorWrapper):
         first = _rows(observations, ended)
         if ended.size:  # what was seen before the reset
             overwrite(observations, ended, _batched(infos["final_obs"][ended]))
-        self.advance(observations)
+        self.advance(observations, np.asarray(actions), rewards)
         if ended.size:
             last = self.wrap(_rows(observations, ended), ended)
             for row, lane in enumerate(ended.tolist()):
@@ -98,41 +100,59 @@ class SameStepWrapper(VectorWrapper):
     def _set_space(self, space: gym.Space) -> None:
         self.single_observation_space, self.observation_space = space, batch_space(space, self.num_envs)
 
+    def _add_part(self, name: str, part: gym.spaces.Box) -> None:
+        """Makes the space a Dict of the environment's own parts and this one."""
+        space = self.env.single_observation_space
+        if name in named(space):
+            raise ValueError(f"the observation already has a part {name!r}: {space}")
+        self._set_space(gym.spaces.Dict({**named(space), name: part}))
+
 
 class PictureWrapper(SameStepWrapper):
     """A wrapper that changes the picture in the observation: all of it, or the only picture in a Dict.
 
-    Raises ValueError for an observation without a (H, W, 3) uint8 picture, or with several.
+    channels: how many a picture may have.
+
+    Raises ValueError for an observation without such a (H, W, channels) uint8 picture, or with several.
     """
+
+    channels: ClassVar[tuple[int, ...]] = (3,)
 
     def __init__(self, env: VectorEnv):
         super().__init__(env)
         space = env.single_observation_space
-        parts = dict(space.spaces) if isinstance(space, gym.spaces.Dict) else {None: space}
-        names = [name for name, part in parts.items() if _is_picture(part)]
+        parts = named(space)
+        names = [name for name, part in parts.items() if self._is_picture(part)]
         if len(names) != 1:
-            raise ValueError(f"{type(self).__name__} needs one (H, W, 3) uint8 picture to observe, not {space}")
-        self.part = names[0]  # of a Dict, or None
-        self.picture_shape = parts[self.part].shape  # (H, W, 3)
+            shape = f"(H, W, {' or '.join(map(str, self.channels))})"
+            raise ValueError(f"{type(self).__name__} needs one {shape} uint8 picture to observe, not {space}")
+        self.part = names[0]
+        self.picture_shape = parts[self.part].shape  # (H, W, channels)
 
     def picture(self, observations: Any) -> np.ndarray:
-        """The pictures of the observations, (n, H, W, 3)."""
-        return observations if self.part is None else observations[self.part]
+        """The pictures of the observations, (n, H, W, channels)."""
+        return named(observations)[self.part]
 
     def replaced(self, whole: Any, picture: Any) -> Any:
         """Observations, or their space, with another picture."""
-        return picture if self.part is None else {**whole, self.part: picture}
+        return {**named(whole), self.part: picture} if isinstance(whole, (dict, gym.spaces.Dict)) else picture
+
+    def _is_picture(self, space: gym.Space) -> bool:
+        image = isinstance(space, gym.spaces.Box) and space.dtype == np.uint8
+        return image and len(space.shape) == 3 and space.shape[2] in self.channels
 
 
 class GrayscaleStack(PictureWrapper):
     """The last K pictures in grayscale instead of the last one in colour (thesis 6.2.1 has K = 4 and 16).
 
-    env: pictures may be of any size. frames: K.
+    env: pictures may be of any size, and gray already (H, W, 1). frames: K.
     Observation: Box (H, W, K) uint8, the newest frame last; other parts of a Dict stay as they are. An episode begins
     with its first frame K times, as in the thesis' code and CleanRL's. Gray is 0.30 red + 0.59 green + 0.11 blue.
 
     Raises ValueError for an environment without same-step autoreset or picture, and for K below 1.
     """
+
+    channels = (1, 3)
 
     def __init__(self, env: VectorEnv, frames: int = 4):
         super().__init__(env)
@@ -145,7 +165,7 @@ class GrayscaleStack(PictureWrapper):
         """Fills the lanes' stacks with their first frame."""
         self._stack[lanes] = gray(self.picture(observations))[..., None]
 
-    def advance(self, observations: Any) -> None:
+    def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
         """Puts a frame on each stack."""
         # Every entry moves one place forward. What comes in from the next pixel is where the new frame goes.
         entries = self._stack.reshape(-1)
@@ -160,34 +180,44 @@ class GrayscaleStack(PictureWrapper):
 class VectorStack(SameStepWrapper):
     """The last K vectors instead of the last one, for vector observations as `GrayscaleStack` for pictures.
 
-    frames: K.
-    Observation: Box (K * V,) float32, the newest vector last. An episode begins with its first vector K times.
+    frames: K. Of a Dict of vectors, each is stacked by itself.
+    Observation: Box (K * V,), the newest vector last, or a Dict of such. An episode begins with its first vector K
+    times.
 
-    Raises ValueError for an environment without same-step autoreset or vectors (V,) as observation, and for K below 1.
+    Raises ValueError for an environment without same-step autoreset or other than vectors (V,) as observation, and for
+    K below 1.
     """
 
     def __init__(self, env: VectorEnv, frames: int = 4):
         super().__init__(env)
-        space = env.single_observation_space
-        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
-            raise ValueError(f"VectorStack needs a vector to observe, not {space}")
-        frames = stack_size(frames)
-        self._stack = np.zeros((self.num_envs, frames, *space.shape), space.dtype)
-        low, high = (np.tile(bound, frames) for bound in (space.low, space.high))
-        self._set_space(gym.spaces.Box(low, high, dtype=space.dtype))
+        space, frames = env.single_observation_space, stack_size(frames)
+        parts = named(space)
+        if not all(isinstance(part, gym.spaces.Box) and len(part.shape) == 1 for part in parts.values()):
+            raise ValueError(f"VectorStack needs a vector to observe, or a Dict of vectors, not {space}")
+        self._stacks = {k: np.zeros((self.num_envs, frames, *part.shape), part.dtype) for k, part in parts.items()}
+        stacked = {}
+        for name, part in parts.items():
+            low, high = (np.tile(bound, frames) for bound in (part.low, part.high))
+            stacked[name] = gym.spaces.Box(low, high, dtype=part.dtype)
+        self._set_space(gym.spaces.Dict(stacked) if isinstance(space, gym.spaces.Dict) else stacked[OBSERVATION])
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
         """Fills the lanes' stacks with their first vector."""
-        self._stack[lanes] = observations[:, None]
+        for name, vectors in named(observations).items():
+            self._stacks[name][lanes] = vectors[:, None]
 
-    def advance(self, observations: Any) -> None:
+    def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
         """Puts a vector on each stack."""
-        self._stack[:, :-1] = self._stack[:, 1:]
-        self._stack[:, -1] = observations
+        for name, vectors in named(observations).items():
+            stack = self._stacks[name]
+            stack[:, :-1] = stack[:, 1:]
+            stack[:, -1] = vectors
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
         """A copy of the lanes' stacks."""
-        return self._stack[lanes].reshape(-1, *self.single_observation_space.shape).copy()
+        stacks = {name: np.array(each[lanes]) for name, each in self._stacks.items()}  # (n, K, V)
+        flat = {name: each.reshape(len(each), -1) for name, each in stacks.items()}  # (n, K * V)
+        return flat if isinstance(observations, dict) else flat[OBSERVATION]
 
 
 class StepEncoding(SameStepWrapper):
@@ -206,25 +236,53 @@ class StepEncoding(SameStepWrapper):
         if not isinstance(width, (int, np.integer)) or width < 2 or width % 2:
             raise ValueError(f"width must be an even integer of at least 2, not {width!r}")
         self.width, self._steps = int(width), np.zeros(self.num_envs, np.int64)
-        space = env.single_observation_space
-        parts = dict(space.spaces) if isinstance(space, gym.spaces.Dict) else {OBSERVATION: space}
-        if STEP_ENCODING in parts:
-            raise ValueError(f"the observation already has a part {STEP_ENCODING!r}: {space}")
-        encoding = gym.spaces.Box(-1.0, 1.0, (self.width,), np.float32)
-        self._set_space(gym.spaces.Dict({**parts, STEP_ENCODING: encoding}))
+        self._add_part(STEP_ENCODING, gym.spaces.Box(-1.0, 1.0, (self.width,), np.float32))
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
         """Sets the lanes' step numbers to 0."""
         self._steps[lanes] = 0
 
-    def advance(self, observations: Any) -> None:
+    def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
         """Counts a step."""
         self._steps += 1
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
         """The lanes' observations with their step numbers' encodings, (n, D)."""
-        parts = observations if isinstance(observations, dict) else {OBSERVATION: observations}
-        return {**parts, STEP_ENCODING: sinusoidal(self._steps[lanes], self.width)}
+        return {**named(observations), STEP_ENCODING: sinusoidal(self._steps[lanes], self.width)}
+
+
+class LastAction(SameStepWrapper):
+    """The action and the reward of the step before, beside the observation.
+
+    Works with any observation, and with Discrete and one-dimensional MultiDiscrete actions.
+    Observation: Dict of `last_action`, Box (V,) float32, and the environment's own parts, or `observation` if it is no
+    Dict. The vector is the action one-hot, branch after branch, then the reward; zeros at an episode's beginning.
+
+    Raises ValueError for an environment without same-step autoreset, with other actions or with a part of that name.
+    """
+
+    def __init__(self, env: VectorEnv):
+        super().__init__(env)
+        self._branches = branch_sizes(env.single_action_space)
+        width = int(self._branches.sum()) + 1
+        self._last = np.zeros((self.num_envs, width), np.float32)
+        low, high = np.zeros(width, np.float32), np.ones(width, np.float32)
+        low[-1], high[-1] = -np.inf, np.inf
+        self._add_part(LAST_ACTION, gym.spaces.Box(low, high, dtype=np.float32))
+
+    def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
+        """Forgets the lanes' actions."""
+        self._last[lanes] = 0.0
+
+    def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
+        """Keeps the step's action and reward."""
+        choices = actions.reshape(self.num_envs, -1) - self.env.single_action_space.start  # (N, A)
+        self._last[:, :-1] = one_hot(choices, self._branches)
+        self._last[:, -1] = rewards
+
+    def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
+        """The lanes' observations with a copy of their last actions."""
+        return {**named(observations), LAST_ACTION: np.array(self._last[lanes])}
 
 
 class SpotlightPerturbation(PictureWrapper):
@@ -270,7 +328,7 @@ class SpotlightPerturbation(PictureWrapper):
         s.place[:, lanes] = spot_places(s.spots[:, lanes]).astype(np.int64) + s.spot_key[lanes]
         s.spots[TIME, lanes] += s.spots[SPEED, lanes]
 
-    def advance(self, observations: Any) -> None:
+    def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
         """Moves the spotlights on."""
         self._light.advance(np.zeros((self.num_envs, 2), np.int64))
 
@@ -289,8 +347,33 @@ class SpotlightPerturbation(PictureWrapper):
         return self.replaced(observations, veiled.reshape(-1, *self.picture_shape))
 
 
+def named(observation: Any) -> dict[str, Any]:
+    """An observation, or its space, as parts by name: those of a dict, or its only one."""
+    if isinstance(observation, gym.spaces.Dict):
+        return observation.spaces
+    return observation if isinstance(observation, dict) else {OBSERVATION: observation}
+
+
+def branch_sizes(space: gym.Space) -> np.ndarray:
+    """The number of actions of each branch, (A,); raises ValueError for other than Discrete and MultiDiscrete."""
+    if isinstance(space, gym.spaces.Discrete):
+        return np.array([space.n])
+    if isinstance(space, gym.spaces.MultiDiscrete) and space.nvec.ndim == 1:
+        return space.nvec
+    raise ValueError(f"the action space {brief(space)} is not supported; use Discrete or one-dimensional MultiDiscrete")
+
+
+def one_hot(choices: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Choices (n, A) from 0 to sizes - 1, each one-hot, side by side: (n, sum of the sizes) float32."""
+    found = np.zeros((len(choices), sizes.sum()), np.float32)
+    found[np.arange(len(choices))[:, None], choices + (np.cumsum(sizes) - sizes)] = 1.0
+    return found
+
+
 def gray(frames: np.ndarray) -> np.ndarray:
-    """Colour pictures (..., 3) uint8 in grayscale, (...) uint8, rounded to the nearest."""
+    """Pictures (..., 3) or (..., 1) uint8 in grayscale, (...) uint8, rounded to the nearest."""
+    if frames.shape[-1] == 1:
+        return frames[..., 0]
     return (frames @ LUMA + np.float32(0.5)).astype(np.uint8)
 
 
@@ -306,11 +389,6 @@ def sinusoidal(positions: np.ndarray, width: int) -> np.ndarray:
     rates = 10000.0 ** -(np.arange(0, width, 2) / width)  # (width / 2,)
     angles = positions[:, None] * rates
     return np.stack([np.sin(angles), np.cos(angles)], axis=2).reshape(-1, width).astype(np.float32)
-
-
-def _is_picture(space: gym.Space) -> bool:
-    image = isinstance(space, gym.spaces.Box) and space.dtype == np.uint8
-    return image and len(space.shape) == 3 and space.shape[2] == 3
 
 
 def _rows(observations: Any, lanes: np.ndarray) -> Any:

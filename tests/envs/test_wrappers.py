@@ -166,7 +166,7 @@ def test_needs_a_picture(wrapper):
     [
         (GrayscaleStack, {"frames": 0}, "frames must be an integer of at least 1, not 0"),
         (GrayscaleStack, {"frames": 4.0}, "frames"),
-        (VectorStack, {}, "VectorStack needs a vector to observe, not Box"),
+        (VectorStack, {}, "VectorStack needs a vector to observe, or a Dict of vectors, not Box"),
         (StepEncoding, {"width": 15}, "width must be an even integer of at least 2, not 15"),
         (StepEncoding, {"width": 0}, "width"),
         (SpotlightPerturbation, {"opacity": 256}, "opacity must be an integer from 0 to 255, not 256"),

@@ -1,0 +1,394 @@
+"""Making any Gymnasium id ready to train on, for scripts that do not ask what the environment is.
+
+`make_envs` is a table of contents of vector wrappers. What a training script counts and logs is read from infos:
+`final_numbers` and `final_observations` take from them what belongs to the episodes that just ended.
+Shape letters: N lanes, A action branches, H, W and C of a picture, V of a vector.
+"""
+
+import contextlib
+import importlib
+import json
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec, load_env_creator
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
+from gymnasium.wrappers.vector import RecordEpisodeStatistics, RecordVideo, TransformAction
+
+from memory_gym_envs.base import MemoryGymVectorEnv
+from memory_gym_envs.options import brief
+from memory_gym_envs.wrappers import (
+    GrayscaleStack,
+    LastAction,
+    SpotlightPerturbation,
+    StepEncoding,
+    VectorStack,
+    branch_sizes,
+    named,
+    one_hot,
+)
+
+SMALLEST_PICTURE = 36  # pixels along a side; what is smaller becomes a vector
+MAX_VIDEO_FRAMES = 1000
+
+
+def make_envs(
+    env_id: str,
+    num_envs: int,
+    *,
+    seed: int | None = None,
+    options: dict[str, Any] | None = None,
+    num_levels: int = 0,
+    start_level: int = 0,
+    obs_type: str = "pixels",
+    frame_stack: int = 0,
+    step_encoding: bool = False,
+    observe_last_action: bool = False,
+    spotlight_perturbation: bool = False,
+    render_mode: str | None = None,
+    video_folder: str | None = None,
+) -> VectorEnv:
+    """Make a vector environment of N lanes with same-step autoreset; the caller's `reset(options=options)` begins.
+
+    env_id: a Gymnasium id, or "module:id" if importing a module registers it.
+    seed: of all lanes, which get streams of their own; the next reset needs none. options: see `parse_options`.
+    num_levels, start_level, obs_type: of Memory Gym environments; others have no such thing and ignore them.
+    frame_stack, step_encoding, observe_last_action, spotlight_perturbation: see GrayscaleStack and VectorStack,
+        StepEncoding, LastAction, SpotlightPerturbation.
+    render_mode: what render() draws; of other packages than this, always rgb_array.
+    video_folder: where to write videos of lane 0, see `LaneVideo`.
+
+    Observations are dicts of pictures and vectors, see `ObservationParts`; actions are integers (N, A), see
+    `branch_actions`; infos hold the statistics of ended episodes, see Gymnasium's vector RecordEpisodeStatistics.
+
+    Raises gymnasium.error.Error for an unknown id, ImportError for a missing package, ValueError for an environment
+    that cannot be made or that is not supported, and for wrong arguments.
+    """
+    spec, memory_gym = find_spec(env_id), is_memory_gym(env_id)
+    if video_folder is not None:
+        check_can_film(spec)
+        render_mode = render_mode or "debug_rgb_array"
+    levels = {"num_levels": num_levels, "start_level": start_level, "obs_type": obs_type}
+    kwargs = levels if memory_gym else {}
+    if render_mode is not None:
+        kwargs["render_mode"] = render_mode if memory_gym else "rgb_array"
+    with one_line_errors(f"{env_id} cannot be made"):
+        envs = same_step_envs(spec, num_envs, kwargs)
+
+    envs = ObservationParts(branch_actions(envs))
+    if spotlight_perturbation:
+        with one_line_errors("--spotlight-perturbation"):
+            envs = SpotlightPerturbation(envs)
+    if frame_stack:
+        pictures = any(len(part.shape) == 3 for part in envs.single_observation_space.values())
+        with one_line_errors("--frame-stack"):
+            envs = (GrayscaleStack if pictures else VectorStack)(envs, frame_stack)
+    if step_encoding:
+        envs = StepEncoding(envs)
+    if observe_last_action:
+        envs = LastAction(envs)
+
+    if seed is not None:
+        with one_line_errors(f"{env_id} cannot be reset"):
+            # Neighbouring seeds must not share lanes, so the lanes' seeds count up from a hash of the seed.
+            envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]), options=options)
+    # An explicit seed is a level of its own, which nobody plays: what counts episodes comes after it.
+    envs = RecordEpisodeStatistics(envs)
+    return envs if video_folder is None else LaneVideo(envs, video_folder)
+
+
+# ---- ids and options ----
+
+
+def find_spec(env_id: str) -> EnvSpec:
+    """What is registered for the id, or for "module:id" once the module is imported."""
+    module, _, name = env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    return gym.spec(name)
+
+
+def is_memory_gym(env_id: str) -> bool:
+    """Whether the id is one of this package's environments, which have levels and reset parameters."""
+    return str(find_spec(env_id).entry_point).startswith("memory_gym_envs")
+
+
+def parse_options(env_id: str, text: str) -> dict[str, Any] | None:
+    """Parse --env-options; raise ValueError if it is no JSON object or the environment has no such parameters."""
+    try:
+        options = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"--env-options is no JSON ({error}): {text}") from None
+    if not isinstance(options, dict):
+        raise ValueError(f'--env-options must be a JSON object such as {{"visual_feedback": false}}, not {text}')
+    if options and not is_memory_gym(env_id):
+        raise ValueError(f"--env-options are reset parameters of Memory Gym environments; {env_id} has none")
+    return options or None
+
+
+# ---- the environments themselves ----
+
+
+def same_step_envs(spec: EnvSpec, num_envs: int, kwargs: dict[str, Any]) -> VectorEnv:
+    """Make the id's own vector environment if it resets in the same step, else Gymnasium's synchronous one.
+
+    Raises ValueError if there is no environment that resets in the same step.
+    """
+    own = spec.vector_entry_point
+    if own is not None and (spec.entry_point is None or resets_in_same_step(creator(own))):
+        envs = gym.make_vec(spec.id, num_envs, vectorization_mode="vector_entry_point", **kwargs)
+    else:
+        same_step = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        envs = gym.make_vec(spec.id, num_envs, vectorization_mode="sync", vector_kwargs=same_step, **kwargs)
+    if not resets_in_same_step(envs):
+        raise ValueError(f"{spec.id} does not reset an ended episode in the same step")
+    return envs
+
+
+def creator(entry_point: str | Callable) -> Callable:
+    """What makes the environment: its class, as a rule."""
+    return load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+
+
+def resets_in_same_step(envs: Any) -> bool:
+    """Whether the metadata of an environment, or of its class, says so."""
+    return getattr(envs, "metadata", {}).get("autoreset_mode") == AutoresetMode.SAME_STEP
+
+
+@contextlib.contextmanager
+def one_line_errors(what: str) -> Iterator[None]:
+    """Turn what an environment raises into a ValueError of one line that begins with what failed.
+
+    Errors whose cause is the machine or the installation stay as they are.
+    """
+    try:
+        yield
+    except (gym.error.Error, ImportError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        raise ValueError(f"{what}: {' '.join((str(error) or repr(error)).split())}") from error
+
+
+# ---- actions ----
+
+
+def branch_actions(envs: VectorEnv) -> VectorEnv:
+    """Make the environment take one integer from 0 per branch, (N, A): a MultiDiscrete space, whatever it was.
+
+    Raises ValueError for other spaces than Discrete and one-dimensional MultiDiscrete.
+    """
+    space = envs.single_action_space
+    sizes = branch_sizes(space)
+
+    def to_env(actions: np.ndarray) -> np.ndarray:
+        actions = actions + space.start  # the first action's number, 0 unless the space says otherwise
+        return actions[:, 0] if isinstance(space, gym.spaces.Discrete) else actions
+
+    return TransformAction(envs, to_env, single_action_space=gym.spaces.MultiDiscrete(sizes))
+
+
+# ---- observations ----
+
+
+class ObservationParts(VectorWrapper):
+    """Every observation as a dict of named parts, in `final_obs` too: each a picture or a vector.
+
+    The parts of a Dict keep their names and their order; any other observation is one part named "observation".
+    Pictures are Box (H, W, C) with sides of at least 36, uint8, or float32 from 0 to 1; two-dimensional ones get a
+    channel, and channels that come first go last. All else becomes a vector (V,) float32, as Gymnasium's `flatten`
+    makes it: Box of any shape, Discrete and MultiDiscrete (one-hot), MultiBinary, and Tuple and Dict of these.
+    Text is left out, and a line on stderr says so.
+
+    Raises ValueError for other spaces, for pictures of other numbers, and if nothing is left to observe.
+    """
+
+    def __init__(self, env: VectorEnv):
+        super().__init__(env)
+        given = named(env.single_observation_space)
+        texts = [name for name, space in given.items() if is_text(space)]
+        if texts:
+            print(f"{env.spec.id}: the text {', '.join(texts)} is left out of the observation", file=sys.stderr)
+        self._convert = {name: converter(name, space) for name, space in given.items() if name not in texts}
+        if not self._convert:
+            raise ValueError(
+                f"the observation space {brief(env.single_observation_space)} is not supported; it is all text"
+            )
+        parts = {name: converted_space(given[name], convert) for name, convert in self._convert.items()}
+        self.single_observation_space = gym.spaces.Dict(parts, sort_keys=False)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """The environment's reset, its observations in parts."""
+        observations, infos = self.env.reset(seed=seed, options=options)
+        return self.parts(observations), infos
+
+    def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], Any, Any, Any, dict[str, Any]]:
+        """One step of every lane, its observations in parts, those in `final_obs` too."""
+        observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        if "final_obs" in infos:
+            space, final, (ended,) = (
+                self.env.single_observation_space,
+                infos["final_obs"],
+                infos["_final_obs"].nonzero(),
+            )
+            last = self.parts(concatenate(space, final[ended], create_empty_array(space, len(ended))))
+            for row, lane in enumerate(ended.tolist()):
+                final[lane] = {name: part[row] for name, part in last.items()}
+        return self.parts(observations), rewards, terminated, truncated, infos
+
+    def parts(self, observations: Any) -> dict[str, np.ndarray]:
+        """The parts of observations, each (N, ...); no copies of what is right already."""
+        given = named(observations)
+        return {name: convert(given[name]) for name, convert in self._convert.items()}
+
+
+def converter(name: str, space: gym.Space) -> Callable[[Any], np.ndarray]:
+    """What makes pictures or vectors of a batch of this part of the observations; ValueError if nothing can."""
+    if isinstance(space, gym.spaces.Box):
+        layout = picture_layout(space.shape)
+        if layout is not None and (space.dtype == np.uint8 or (space.low.min() >= 0 and space.high.max() <= 1)):
+            return partial(as_pictures, layout)
+        supported = layout in (None, "HW")  # a matrix of other numbers is no picture
+    else:
+        supported = is_flattenable(space)
+    if supported:
+        return partial(as_vectors, space)
+    raise ValueError(
+        f"the observation space {name}: {brief(space)} is not supported; use pictures (height, width, "
+        "channels) of bytes or of numbers from 0 to 1, Box, Discrete, MultiDiscrete, MultiBinary, Tuple or Dict"
+    )
+
+
+def converted_space(space: gym.Space, convert: Callable[[Any], np.ndarray]) -> gym.spaces.Box:
+    """The space of what `converter` makes of one observation from this space."""
+    with np.errstate(over="ignore"):  # bounds beyond float32 become infinite
+        if convert.func is as_vectors:
+            flat = gym.spaces.flatten_space(space)
+            return gym.spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32))
+        low, high = (convert(bound[None])[0] for bound in (space.low, space.high))
+        return gym.spaces.Box(low, high, dtype=low.dtype)
+
+
+def picture_layout(shape: tuple[int, ...]) -> str | None:
+    """Which axes of a Box are a picture's: height, width and channels; None if it is too small to be one."""
+    large = tuple(side >= SMALLEST_PICTURE for side in shape)
+    layouts = {(True, True): "HW", (True, True, False): "HWC", (True, True, True): "HWC", (False, True, True): "CHW"}
+    return layouts.get(large)
+
+
+def as_pictures(layout: str, values: np.ndarray) -> np.ndarray:
+    """A batch of pictures in this layout as (N, H, W, C), bytes or float32."""
+    if layout == "HW":
+        values = values[..., None]
+    elif layout == "CHW":
+        values = np.moveaxis(values, 1, -1)
+    return np.ascontiguousarray(values, np.uint8 if values.dtype == np.uint8 else np.float32)
+
+
+def as_vectors(space: gym.Space, values: Any) -> np.ndarray:
+    """What Gymnasium's `flatten` makes of each of a batch of observations, (N, V) float32, all lanes at once."""
+    if isinstance(space, gym.spaces.Dict):
+        return np.concatenate([as_vectors(part, values[name]) for name, part in space.spaces.items()], axis=1)
+    if isinstance(space, gym.spaces.Tuple):
+        return np.concatenate([as_vectors(*each) for each in zip(space.spaces, values, strict=True)], axis=1)
+    rows = np.reshape(values, (len(values), -1))
+    if isinstance(space, gym.spaces.Discrete):
+        return one_hot(rows - space.start, np.array([space.n]))
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        return one_hot(rows - space.start.ravel(), space.nvec.ravel())
+    return np.ascontiguousarray(rows, np.float32)
+
+
+def is_flattenable(space: gym.Space) -> bool:
+    """Whether `as_vectors` knows the space, and what is in it."""
+    if isinstance(space, (gym.spaces.Dict, gym.spaces.Tuple)):
+        inside = list(named(space).values()) if isinstance(space, gym.spaces.Dict) else space.spaces
+        return bool(inside) and all(map(is_flattenable, inside))
+    known = gym.spaces.Box, gym.spaces.Discrete, gym.spaces.MultiDiscrete, gym.spaces.MultiBinary
+    return isinstance(space, known)
+
+
+def is_text(space: gym.Space) -> bool:
+    """Whether the space is of strings: Gymnasium's Text, or one of a package's own such as MiniGrid's missions."""
+    return space.dtype is not None and space.dtype.kind == "U"
+
+
+# ---- what infos say of ended episodes ----
+
+
+def final_numbers(infos: dict[str, Any], lanes: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield each number in the final infos of the given lanes: its name, which of them have it (N,), and theirs.
+
+    lanes: (N,) bool.
+    """
+    final = infos.get("final_info", {})
+    for name, values in final.items():
+        which = lanes & final.get(f"_{name}", False)
+        if which.any() and isinstance(values, np.ndarray) and all(np.isscalar(value) for value in values[which]):
+            found = np.array(values[which].tolist())
+            if found.dtype.kind in "biuf":
+                yield name, which, found
+
+
+def final_observations(
+    observations: dict[str, np.ndarray], infos: dict[str, Any], lanes: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Copies of observations (N, ...) in which the given lanes hold the last one of the episode that just ended.
+
+    lanes: (N,) bool.
+    """
+    observations = {name: part.copy() for name, part in observations.items()}
+    for lane in np.flatnonzero(lanes):
+        for name, part in infos["final_obs"][lane].items():
+            observations[name][lane] = part
+    return observations
+
+
+# ---- videos ----
+
+
+class LaneVideo(RecordVideo):
+    """Videos of lane 0: of the episodes that Gymnasium's capped cubic schedule picks (0, 1, 8, 27, ...).
+
+    A video shows every observation that was acted on, up to the first 1,000. What is being recorded is written by
+    close().
+    """
+
+    def __init__(self, env: VectorEnv, folder: str):
+        with warnings.catch_warnings():
+            # That the observation after an episode's last action is missing, and that the folder is there already.
+            warnings.simplefilter("ignore")
+            super().__init__(env, folder, record_first_only=True)
+
+    def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], Any, Any, Any, dict[str, Any]]:
+        """One step of every lane; a video that is long enough ends here."""
+        result = super().step(actions)
+        if self.recording and len(self.recorded_frames) >= MAX_VIDEO_FRAMES:
+            self.stop_recording()
+        return result
+
+    def _capture_frame(self) -> None:
+        """Keep lane 0's picture; Gymnasium's own method has all lanes draw theirs, 32 times the work."""
+        envs = self.unwrapped
+        if isinstance(envs, MemoryGymVectorEnv):
+            (picture,) = envs.render(np.zeros(1, np.intp))
+        else:
+            picture = envs.envs[0].render() if isinstance(envs, SyncVectorEnv) else envs.render()[0]
+        self.recorded_frames.append(picture)
+
+
+def check_can_film(spec: EnvSpec) -> None:
+    """Raise ImportError without the extra `play`, ValueError if the environment says that it draws no pictures."""
+    try:
+        importlib.import_module("moviepy")
+    except ImportError:
+        raise ImportError('--capture-video needs moviepy: pip install -e ".[play]"') from None
+    metadata = getattr(creator(spec.entry_point or spec.vector_entry_point), "metadata", None)
+    if metadata is not None and "rgb_array" not in metadata.get("render_modes", ()):
+        raise ValueError(f"--capture-video needs an environment that draws pictures (rgb_array); {spec.id} draws none")
