@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 import ppo_gru
 import ppo_trxl
+from memory_gym_envs.making import final_numbers, is_memory_gym, parse_options
 
 try:
     from PIL import Image
@@ -112,30 +113,30 @@ def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, options: dict 
     torch.manual_seed(seed)
     episode = Episode()
     obs, infos = envs.reset(seed=seed, options=options)
-    live = agent.memory.initial(max_steps, 1, torch.device("cpu"))
+    memory = agent.memory.initial_state(1, max_steps, torch.device("cpu"))
     while not episode.finished and len(episode.actions) < max_steps:
         for name, frame in views(envs, obs).items():
             episode.film(name, frame)
         if "ground_truth" in infos:
             episode.truth.append(infos["ground_truth"][0])
-        actions, live = think(agent, ppo_gru.as_tensors(obs), live, episode)
-        chosen = ppo_gru.to_env_actions(actions, envs.single_action_space)
-        obs, rewards, terminated, truncated, infos = envs.step(chosen)
+        actions, memory = act(agent, ppo_gru.as_tensors(obs, torch.device("cpu")), memory, episode)
+        obs, rewards, terminated, truncated, infos = envs.step(actions.numpy())
         episode.rewards.append(float(rewards[0]))
         episode.finished = bool(terminated[0] or truncated[0])
     if episode.finished:
-        episode.final = {name: values.item() for name, _, values in ppo_gru.final_numbers(infos, np.ones(1, bool))}
+        episode.final = {name: values.item() for name, _, values in final_numbers(infos, np.ones(1, bool))}
     return episode
 
 
-def think(agent: nn.Module, obs: dict[str, Tensor], live: Any, episode: Episode) -> tuple[Tensor, Any]:
-    """Choose actions (1, A) and add what went on in the agent's head; return also its new memory."""
-    x = agent.encoder(ppo_gru.on_device(obs, torch.device("cpu")))
-    if hasattr(agent.memory, "attention"):
-        episode.attention.append(agent.memory.attention(x, live)[0].numpy())
-    y, live, _ = agent.memory.step(x, live)
-    policy, values, features = agent.heads(y)
-    actions = ppo_gru.draw(policy)
+def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode) -> tuple[Tensor, Any]:
+    """Do as `Agent.act` does, and add what the agent computed to the episode; return actions (1, A) and its memory."""
+    x = agent.encoder(obs)
+    if isinstance(agent.memory, ppo_trxl.Memory):
+        episode.attention.append(attention_of(agent.memory, x, memory)[0].numpy())
+    y, memory = agent.memory.step(x, memory)
+    logits, values, features = agent.heads(y)
+    policy = agent.heads.distributions(logits)
+    actions = torch.stack([branch.sample() for branch in policy], -1)
     episode.policy.append([branch.probs[0].numpy() for branch in policy])
     episode.actions.append(actions[0].tolist())
     episode.values.append(values.item())
@@ -144,17 +145,38 @@ def think(agent: nn.Module, obs: dict[str, Tensor], live: Any, episode: Episode)
         episode.film(RECONSTRUCTION, displayable(agent.decoder(features).sigmoid()[0].numpy()))
     if agent.estimator is not None:
         episode.estimate.append(agent.estimator(features)[0].numpy())
-    return actions, live
+    return actions, memory
 
 
-def views(envs: gym.vector.VectorEnv, obs: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def attention_of(memory: ppo_trxl.Memory, x: Tensor, state: ppo_trxl.MemoryState) -> Tensor:
+    """Return what the next step, x (N, D), attends to: weights (N, K, H, M) of the last M steps, the oldest first."""
+    rows, age, seen = memory.look_back(state)
+    x, found = x[:, None], []  # (N, 1, D)
+    encoding = memory.query_encoding(state.episode_step[:, None], x.dtype)
+    for k, block in enumerate(memory.blocks):
+        position = encoding if k == 0 else 0.0
+        keys_values = state.keys[k][:, rows], state.values[k][:, rows]
+        query = block.norm_query(x + position)
+        found.append(attention_weights(block.attention, query, keys_values[0], age, seen)[:, :, 0])
+        x = block(x, position, keys_values, age, seen)
+    return torch.stack(found, 1)
+
+
+def attention_weights(attention: ppo_trxl.Attention, x: Tensor, keys: Tensor, age: Tensor, seen: Tensor) -> Tensor:
+    """Return the weights (S, H, L, M) that `Attention.forward` gives to the items; its fused kernel does not."""
+    query, mask, sees_nothing = attention.query_and_mask(x, age, seen)
+    bias = torch.zeros_like(mask, dtype=x.dtype).masked_fill(~mask, -math.inf) if mask.dtype == torch.bool else mask
+    scores = query @ attention.split(keys).transpose(2, 3) / math.sqrt(query.shape[-1])
+    return (scores + bias).softmax(-1).masked_fill(sees_nothing[:, None], 0.0)
+
+
+def views(envs: gym.vector.VectorEnv, obs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return frames by name: what the agent sees (drawn for it, if it gets vectors only) and the ground truth."""
-    parts = obs if isinstance(obs, dict) else {"observation": obs}
-    pictures = {name: displayable(part[0]) for name, part in parts.items() if part.ndim == 4}
+    pictures = {name: displayable(part[0]) for name, part in obs.items() if part.ndim == 4}
     frames = {VIEW if len(pictures) == 1 else name: picture for name, picture in pictures.items()}
     if not frames:
         frames["rendered frame"] = rendered(envs, "rgb_array")
-    if ppo_gru.is_memory_gym(envs.spec.id):
+    if is_memory_gym(envs.spec.id):
         frames["ground truth"] = rendered(envs, "debug_rgb_array")
     return frames
 
@@ -215,7 +237,7 @@ def video_data(name: str, video: Video) -> dict[str, Any]:
 def branch_names(env_id: str, branches: list[np.ndarray]) -> dict[str, list[str]]:
     """Name the action branches and their actions: in words for Memory Gym, else by numbers."""
     sizes = [len(branch) for branch in branches]
-    if ppo_gru.is_memory_gym(env_id):
+    if is_memory_gym(env_id):
         return FREE if sizes == [3, 3] else ENDLESS_PATH if "Endless" in env_id else GRID
     return {f"branch {i + 1}": [str(action) for action in range(size)] for i, size in enumerate(sizes)}
 
@@ -254,15 +276,13 @@ def load(path: str) -> tuple[nn.Module, gym.vector.VectorEnv, Any]:
 
     Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
     """
-    try:
-        script, (args, _) = ppo_gru, ppo_gru.load_model(path)
-    except ValueError:  # of the other script, or of none, which it says then
-        script, (args, _) = ppo_trxl, ppo_trxl.load_model(path)
-    args = replace(args, amp=False)  # one lane is no work, and not every processor has bfloat16
-    envs = script.make_envs(args, 1, "debug_rgb_array")
-    _, infos = envs.reset(options=script.reset_options(args.env_id, args.env_options))
+    saved = ppo_gru.read_model(path)
+    script = ppo_trxl if saved["script"] == "ppo_trxl" else ppo_gru
+    args = replace(script.saved_args(saved), amp=False)  # one lane is little work; not every processor has bfloat16
+    envs = script.environments(args, 1, render_mode="debug_rgb_array")
+    _, infos = envs.reset(options=parse_options(args.env_id, args.env_options))
     agent = script.make_agent(envs, infos, args, torch.device("cpu"))
-    script.load_weights(agent, path)
+    script.load_weights(agent, saved, path)
     return agent, envs, args
 
 
@@ -279,7 +299,7 @@ def main(config: Config) -> str:
         raise OSError(f"--out is {out}, but there is no folder {out.parent}")
     agent, envs, args = load(config.checkpoint)
     seed = args.start_level + args.num_levels if config.seed is None else config.seed
-    options = ppo_gru.reset_options(args.env_id, args.env_options)
+    options = parse_options(args.env_id, args.env_options)
     episode = play(agent, envs, seed, options, config.max_steps)
     facts = summary(episode, args, seed)
     out.write_text(page(page_data(episode, args.env_id, facts), get_plotlyjs()), encoding="utf-8")

@@ -11,7 +11,6 @@ seeds: how far the IQM would move with other seeds. A single seed cannot tell, a
 Shape letters: R seeds (training runs) of an agent, M levels, P points of a curve, B bootstrap resamples.
 """
 
-import contextlib
 import itertools
 import json
 import os
@@ -61,7 +60,7 @@ BOOKKEEPING |= {
     "eval_repeats",
     "eval_max_steps",
     "compile",
-    "cuda_graphs",
+    "preset",
 }
 RESAMPLES = 2000
 POINTS = 200  # of a curve; one that has more is averaged over neighbours
@@ -311,29 +310,41 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
 
 
 # ---- SCORES ----
-def load(path: str, config: Config) -> tuple[ModuleType, Any]:
-    """Return the script that trained a checkpoint, and its arguments with this evaluation's settings.
+@dataclass
+class Checkpoint:
+    """What a model file holds, read once."""
 
-    Raises ValueError if the file is no checkpoint, OSError if it cannot be read.
-    """
-    script = ppo_gru  # whose load_model says what is wrong with a file that tells no script
-    with contextlib.suppress(Exception):
-        script = SCRIPTS[torch.load(path, map_location="cpu", weights_only=True)["script"]]
-    args, _ = script.load_model(path)
-    settings = {"eval_levels": config.levels, "eval_repeats": config.repeats, "eval_max_steps": config.max_steps}
-    return script, replace(args, cuda=config.cuda, cuda_graphs=False, **settings)
+    path: str
+    script: ModuleType  # that trained it
+    saved: dict[str, Any]  # as the script's read_model returns it
+    args: Any  # the script's Args, with this evaluation's settings
+
+    @classmethod
+    def read(cls, path: str, config: Config) -> "Checkpoint":
+        """Read a file; raise ValueError if it is no checkpoint, OSError if it cannot be read."""
+        saved = ppo_gru.read_model(path)
+        if saved["script"] not in SCRIPTS:
+            raise ValueError(f"{path} was trained by {saved['script']}.py, which evaluate.py does not know")
+        script = SCRIPTS[saved["script"]]
+        settings = {"eval_levels": config.levels, "eval_repeats": config.repeats, "eval_max_steps": config.max_steps}
+        return cls(path, script, saved, replace(script.saved_args(saved), cuda=config.cuda, **settings))
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments by name, with the script's name."""
+        return {"script": self.script.__name__, **asdict(self.args)}
 
 
-def play(path: str, script: ModuleType, args: Any, seed: int) -> dict[str, np.ndarray]:
+def play(checkpoint: Checkpoint, seed: int) -> dict[str, np.ndarray]:
     """Let a checkpoint's agent play the levels; return numbers (M,) by name, each level's mean over its repeats.
 
     Raises what the script raises for an environment that is not there or weights that do not fit.
     """
+    script, args = checkpoint.script, checkpoint.args
     device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
-    envs = script.make_envs(args, args.eval_levels * args.eval_repeats)
-    _, infos = envs.reset(options=script.reset_options(args.env_id, args.env_options))
+    envs = script.environments(args, args.eval_levels * args.eval_repeats)
+    _, infos = envs.reset(options=script.parse_options(args.env_id, args.env_options))
     agent = script.make_agent(envs, infos, args, device)
-    script.load_weights(agent, path)
+    script.load_weights(agent, checkpoint.saved, checkpoint.path)
     torch.manual_seed(seed)
     found = script.evaluate(agent, envs, args)
     envs.close()
@@ -361,10 +372,10 @@ def choose_metrics(wanted: tuple[str, ...], env_id: str, played: list[dict[str, 
 
 def score_checkpoints(config: Config) -> list[dict[str, Any]]:
     """Play the levels with every checkpoint's agent; print a table for each task, and return what is in it."""
-    models = {path: load(path, config) for path in dict.fromkeys(config.checkpoints)}
-    arguments = {path: {"script": script.__name__, **asdict(args)} for path, (script, args) in models.items()}
+    checkpoints = {path: Checkpoint.read(path, config) for path in dict.fromkeys(config.checkpoints)}
+    arguments = {path: checkpoint.arguments() for path, checkpoint in checkpoints.items()}
     tasks = tasks_of(arguments, title_of)
-    played = {path: play(path, *model, config.seed) for path, model in tqdm(models.items(), unit=" agents")}
+    played = {path: play(each, config.seed) for path, each in tqdm(checkpoints.items(), unit=" agents")}
     report = []
     for title, agents in tasks.items():
         paths = list(itertools.chain(*agents.values()))

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -25,15 +26,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import evaluate
 
 ROOT = Path(__file__).parent.parent
-COMMON = (
-    "--obs-type vector --head-size 128 --num-steps 128 --num-minibatches 8 --update-epochs 4 --clip-coef 0.2 "
-    "--max-grad-norm 0.5 --gamma 0.99 --save-model"
-)
+COMMON = "--preset laptop --save-model"
 AGENTS = {
-    "no memory": "ppo_gru.py --memory none --hidden-size 128",
-    "stack of 4": "ppo_gru.py --memory none --hidden-size 128 --frame-stack 4",
-    "GRU": "ppo_gru.py --memory gru --hidden-size 128",
-    "TrXL": "ppo_trxl.py --trxl-dim 64 --trxl-num-layers 2 --trxl-memory-length 128",
+    "no memory": "ppo_gru.py --memory none",
+    "stack of 4": "ppo_gru.py --memory none --frame-stack 4",
+    "GRU": "ppo_gru.py --memory gru",
+    "TrXL": "ppo_trxl.py",
 }
 
 
@@ -62,7 +60,7 @@ TASKS = {
         },
         "commands_completed",
         2_000_000,
-        "--num-envs 32 --init-lr 1e-3 --final-lr 1e-4 --init-ent-coef 0.01 --final-ent-coef 0.001",
+        "",
     ),
     "mystery-path": Task(
         "MysteryPath-Grid-v0",
@@ -72,8 +70,7 @@ TASKS = {
         "success",
         3_000_000,
         # To remember tiles, an agent has to tell them apart; their coordinates alone differ by a seventh.
-        "--num-envs 32 --init-lr 7e-4 --final-lr 1e-4 --init-ent-coef 0.003 --final-ent-coef 0.0001 "
-        "--vector-frequencies 4",
+        "--init-lr 7e-4 --init-ent-coef 0.003 --final-ent-coef 0.0001 --vector-frequencies 4",
         # Where the agent fell matters, not when.
         "--trxl-positional-encoding none",
     ),
@@ -103,14 +100,18 @@ class Config:
 def command(task: Task, agent: str, seed: int, evaluations: int) -> list[str]:
     """Return the command line of a training run."""
     script, *memory = AGENTS[agent].split()
-    flags = [*memory, *COMMON.split(), *task.flags.split(), *(task.trxl_flags.split() if "trxl" in script else [])]
-    lanes = int(flags[flags.index("--num-envs") + 1])
-    iterations = task.total_timesteps // (lanes * int(flags[flags.index("--num-steps") + 1]))
-    every = str(max(1, iterations // evaluations))
-    length = ["--total-timesteps", str(task.total_timesteps), "--anneal-steps", str(task.total_timesteps)]
-    what = ["--env-id", task.env_id, "--env-options", json.dumps(task.options)]
-    name = ["--exp-name", agent.replace(" ", "-"), "--seed", str(seed), "--eval-interval", every]
-    return [sys.executable, str(ROOT / script), *what, *name, *flags, *length]
+    flags = [*COMMON.split(), *memory, *task.flags.split(), *(task.trxl_flags.split() if "trxl" in script else [])]
+    flags += ["--total-timesteps", str(task.total_timesteps), "--anneal-steps", str(task.total_timesteps)]
+    flags += ["--env-id", task.env_id, "--env-options", json.dumps(task.options)]
+    flags += ["--exp-name", agent.replace(" ", "-"), "--seed", str(seed)]
+    args = parsed(script, flags)
+    every = max(1, task.total_timesteps // (args.num_envs * args.num_steps) // evaluations)
+    return [sys.executable, str(ROOT / script), *flags, "--eval-interval", str(every)]
+
+
+def parsed(script: str, flags: list[str]) -> Any:
+    """Return the script's Args for these flags."""
+    return importlib.import_module(Path(script).stem).parse_args(flags)
 
 
 def folder_of(config: Config, task: Task, agent: str, seed: int) -> str | None:
@@ -128,9 +129,8 @@ def folder_of(config: Config, task: Task, agent: str, seed: int) -> str | None:
 
 def arguments(line: list[str]) -> dict[str, str]:
     """Return a command line's arguments as `evaluate.hyperparameters` tells those of a run."""
-    script = importlib.import_module(Path(line[1]).stem)
-    args = asdict(tyro.cli(script.Args, args=line[2:]))
-    return {"script": script.__name__} | {name: " ".join(str(value).split()) for name, value in args.items()}
+    args = asdict(parsed(line[1], line[2:]))
+    return {"script": Path(line[1]).stem} | {name: " ".join(str(value).split()) for name, value in args.items()}
 
 
 def train(config: Config, task: Task, agent: str, seed: int) -> None:

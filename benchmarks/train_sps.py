@@ -18,7 +18,8 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import torch
 import tyro
@@ -53,16 +54,6 @@ def seconds(work: Callable[[], None], device: torch.device) -> float:
     return time.perf_counter() - start
 
 
-def script_iteration(script, args, run) -> Callable[[], None]:
-    """Return a function that does one training iteration of the script."""
-
-    def iteration() -> None:
-        last_value, _ = script.collect(run.agent, run.envs, run.play, run.rollout, args, None)
-        script.update(run.agent, run.learn, run.rollout, last_value, args.init_ent_coef, args)
-
-    return iteration
-
-
 def bound_iteration(network: torch.nn.Module, args, device: torch.device, chunk: int) -> Callable[[], None]:
     """Return a function that does the network's work of one iteration and nothing else, in pieces of chunk frames."""
     network = network.to(device)
@@ -83,16 +74,17 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, in
     """Return the steps/s of the script and of both bounds, the share of distinct pictures, and the best piece."""
     script = importlib.import_module(config.script)
     flags = ["--env-id", config.env_id, "--num-envs", str(config.num_envs), "--num-steps"]
-    args = tyro.cli(script.Args, args=[*flags, str(num_steps), *config.flags])
-    short = tyro.cli(script.Args, args=[*flags, "32", *config.flags])
+    args = script.parse_args([*flags, str(num_steps), *config.flags])
+    args.total_timesteps = config.num_envs * num_steps  # of one call of train
+    short = replace(args, num_steps=32)
     run = script.setup(args)
     device = run.rollout.values.device
-    cnn = script.AtariCNN(3, max(config.chunks))
+    cnn = script.AtariCNN(3)
     encoder = torch.nn.Sequential(cnn, torch.nn.Linear(3136, run.agent.memory.width), torch.nn.ReLU())
     trials = {chunk: bound_iteration(cnn, short, device, chunk) for chunk in config.chunks}
     best = min(trials, key=lambda chunk: min(seconds(trials[chunk], device) for _ in range(3)))
     work = {
-        "script": script_iteration(script, args, run),
+        "script": partial(script.train, args, run),
         "convolutions": bound_iteration(cnn, args, device, best),
         "encoder": bound_iteration(encoder, args, device, best),
     }
@@ -103,8 +95,7 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, in
     for _ in range(config.rounds):
         for name, iteration in work.items():
             times[name].append(seconds(iteration, device))
-    run.envs.close()
-    run.writer.close()
+    script.close(args, run)
     steps = config.num_envs * num_steps
     distinct = sum(encoded) / (config.rounds * args.update_epochs * steps)
     return {name: steps / statistics.median(taken) for name, taken in times.items()}, distinct, best

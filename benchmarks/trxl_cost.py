@@ -60,16 +60,15 @@ def kept_for_backward(run, args: ppo_trxl.Args) -> list[torch.Tensor]:
 
 def shares(config: Config) -> None:
     """Print the resident memory after an iteration, and the memory's own share."""
-    args = ppo_trxl.Args(env_id=config.env_id, num_steps=config.num_steps)
+    args = ppo_trxl.Args(env_id=config.env_id, num_steps=config.num_steps, total_timesteps=32 * config.num_steps)
     run = ppo_trxl.setup(args)
-    last_value, _ = ppo_trxl.collect(run.agent, run.envs, run.play, run.rollout, args, None)
-    ppo_trxl.update(run.agent, run.learn, run.rollout, last_value, 0.0, args)
+    ppo_trxl.train(args, run)
     resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6  # kilobytes on Linux
-    live, stored = run.play.live, run.rollout.memory
+    memory = run.rollout.memory
     rows = {
         "highest resident memory, all in all": resident,
-        "stored block inputs": megabytes([stored.items, stored.steps]),
-        "cache of keys and values": megabytes([live.keys, live.values]),
+        "stored block inputs": megabytes([memory.items, memory.item_steps]),
+        "cache of keys and values": megabytes([memory.keys, memory.values]),
         "kept of a minibatch for the backward pass": megabytes(kept_for_backward(run, args)),
     }
     print(f"{config.env_id}, 32 x {config.num_steps}, window {args.trxl_memory_length}\n\n| memory | MB |\n|---|---:|")
@@ -82,18 +81,18 @@ def step_times(config: Config, window: int) -> tuple[float, float]:
     """Return the median seconds of a step of the memory with a full window, and of its attention alone."""
     args = ppo_trxl.Args(trxl_memory_length=window, num_steps=config.repeats)
     memory = ppo_trxl.Memory(args)
-    live = memory.initial(args.num_steps, args.num_envs, torch.device("cpu"))
-    live.steps.add_(window)
+    state = memory.initial_state(args.num_envs, args.num_steps, torch.device("cpu"))
+    state.episode_step.add_(window)
     x = torch.randn(args.num_envs, memory.width)
     split = memory.blocks[0].attention.split
     step, attention = [], []
     for _ in range(config.repeats):
         start = time.perf_counter()
-        _, live, _ = memory.step(x, live)
+        _, state = memory.step(x, state)
         step.append(time.perf_counter() - start)
-        rows, _, seen = memory.look_back(live)
+        rows, _, seen = memory.look_back(state)
         start = time.perf_counter()
-        for keys, values in zip(live.keys, live.values, strict=True):
+        for keys, values in zip(state.keys, state.values, strict=True):
             F.scaled_dot_product_attention(
                 split(x[:, None]), split(keys[:, rows]), split(values[:, rows]), seen[:, None]
             )

@@ -37,7 +37,7 @@ def scalars():
     """Read a run folder's curves: a list of values by name."""
 
     def read(folder):
-        events = EventAccumulator(folder)
+        events = EventAccumulator(str(folder))
         events.Reload()
         return {name: [point.value for point in events.Scalars(name)] for name in events.Tags()["scalars"]}
 
@@ -55,7 +55,7 @@ def played(tiny):
             for parameter in run.agent.heads.parameters():
                 parameter.mul_(weights_scale)
         for _ in range(iterations):
-            last_value, episodes = script.collect(run.agent, run.envs, run.play, run.rollout, args, None)
+            last_value, episodes = script.collect(run.agent, run.envs, run.rollout, args)
         return args, run, last_value, episodes
 
     return play

@@ -1,4 +1,4 @@
-"""The auxiliary heads (5.1.2, 5.1.3): what they draw and estimate, which steps they learn from, whom they teach."""
+"""The auxiliary heads (5.1.2, 5.1.3): what they compute, which steps they learn from, whom they teach."""
 
 import dataclasses
 from pathlib import Path
@@ -20,21 +20,23 @@ SCRIPTS = pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
 def loss_of(script, args, run):
     """The loss of a whole rollout, its logs, and the gradients that it leaves."""
     pieces = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated)
-    zeros = torch.zeros_like(run.rollout.values)
+    run.rollout.advantages.zero_()
+    run.rollout.returns.zero_()
     run.agent.zero_grad()
-    loss, logs = script.minibatch_loss(run.agent, run.rollout, (zeros, zeros), pieces, 0.0, args)
+    observations = script.UniqueObservations(run.rollout.obs, run.agent)
+    loss, logs = script.ppo_loss(run.agent, run.rollout, observations, pieces, 0.0, args)
     loss.backward()
     return loss.detach(), logs, {name: p.grad for name, p in run.agent.named_parameters() if p.grad is not None}
 
 
 @pytest.mark.parametrize("shape", [(84, 84, 3), (84, 84, 16), (64, 64, 1), (61, 90, 3), (36, 37, 2)])
-def test_the_decoder_draws_pictures_of_the_observation_s_size(shape):
+def test_the_decoder_reconstructs_pictures_of_the_observation_s_size(shape):
     decoder = Decoder(32, {"picture": gym.spaces.Box(0, 255, shape, np.uint8)})
     assert decoder(torch.randn(2, 32)).shape == (2, *shape)
     assert [layer.out_channels for layer in decoder if hasattr(layer, "out_channels")] == [64, 32, shape[2]]
 
 
-def test_the_decoder_is_the_encoder_turned_round():
+def test_the_decoder_is_the_transposed_encoder():
     decoder = Decoder(512, {"picture": gym.spaces.Box(0, 255, (84, 84, 3), np.uint8)})
     sizes, x = [], torch.randn(1, 512)
     for layer in decoder:
@@ -56,19 +58,20 @@ def test_the_losses_are_means_over_real_steps(played, script):
     args, run, *_ = played(script=script, env_id="MortarMayhemB-Grid-v0", **HEADS)
     loss, logs, _ = loss_of(script, args, run)
     pieces = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated)
-    order = pieces.steps()
+    order = pieces.flat_index()
     assert sorted(order.tolist()) == list(range(64))  # every step once, no padding
     obs = {name: part.flatten(0, 1)[order] for name, part in run.rollout.obs.items()}
     with torch.no_grad():
-        features = run.agent.unroll(obs, torch.arange(64), pieces, run.rollout.memory)[2]
+        actions = run.rollout.actions.flatten(0, 1)[order]
+        features = run.agent.evaluate_actions(obs, torch.arange(64), actions, pieces, run.rollout.memory)[3]
         drawn = torch.sigmoid(run.agent.decoder(features))
         wanted = obs["visual_observation"] / 255
         truths = run.rollout.ground_truth.flatten(0, 1)[order]
         estimate_loss = (run.agent.estimator(features) - truths).square().mean()
-    torch.testing.assert_close(logs["losses/reconstruction_loss"], F.binary_cross_entropy(drawn, wanted))
-    torch.testing.assert_close(logs["losses/ground_truth_loss"], estimate_loss)
+    torch.testing.assert_close(logs["reconstruction_loss"], F.binary_cross_entropy(drawn, wanted))
+    torch.testing.assert_close(logs["ground_truth_loss"], estimate_loss)
     parts = ("policy_loss", "value_loss", "reconstruction_loss", "ground_truth_loss")
-    policy, value, drawn, estimated = (logs[f"losses/{name}"] for name in parts)
+    policy, value, drawn, estimated = (logs[name] for name in parts)
     torch.testing.assert_close(loss, policy + 0.5 * value + 0.1 * drawn + 0.1 * estimated)
 
 
@@ -76,12 +79,12 @@ def test_the_losses_are_means_over_real_steps(played, script):
 def test_the_ground_truth_belongs_to_the_observation(played, script):
     """The same actions, played again: what the infos said when an observation was handed out."""
     args, run, *_ = played(script=script, env_id="MortarMayhemB-Grid-v0", num_steps=32, num_minibatches=1, **HEADS)
-    envs = script.make_envs(args, args.num_envs)
-    _, infos = script.first_reset(envs, args.seed, None)
+    envs = script.environments(args, args.num_envs, seed=args.seed)
+    _, infos = envs.reset()
     assert run.rollout.terminated.any()
     for t in range(32):
         assert run.rollout.ground_truth[t].numpy() == pytest.approx(infos["ground_truth"])
-        *_, infos = envs.step(run.rollout.actions[t, :, 0].numpy())
+        *_, infos = envs.step(run.rollout.actions[t].numpy())
 
 
 @SCRIPTS
@@ -113,7 +116,7 @@ def test_a_run_with_a_probe_is_the_run_without(tiny, scalars, script):
 
 
 def test_heads_that_are_off_cost_nothing(played):
-    plain = Agent(gym.spaces.Box(0, 255, (84, 84, 3), np.uint8), gym.spaces.Discrete(4), Args())
+    plain = Agent(gym.spaces.Dict(observation=gym.spaces.Box(0, 255, (84, 84, 3), np.uint8)), [4], Args())
     assert plain.decoder is plain.estimator is None
     args, run, *_ = played(env_id="CueRecall-v0")
     assert run.rollout.ground_truth is None
@@ -124,7 +127,7 @@ def test_a_head_can_be_added_to_a_trained_agent(tiny):
     """A probe after the training (5.1.2): the agent is the saved one, the head is new."""
     (path,) = Path(ppo_gru.main(tiny(env_id="MortarMayhem-Grid-v0", save_model=True))).glob("model.pt")
     run = ppo_gru.setup(tiny(env_id="MortarMayhem-Grid-v0", load_model=str(path), ground_truth_coef=0.1))
-    weights = ppo_gru.load_model(str(path))[1]
+    weights = ppo_gru.read_model(path)["weights"]
     assert all(run.agent.state_dict()[name].equal(weight) for name, weight in weights.items())
 
 
@@ -145,7 +148,7 @@ def test_both_losses_fall(tiny, scalars, script):
             "needs an environment that has ground_truth, an array",
         ),
         ({"env_id": "CueRecall-v0", "reconstruction_coef": 0.1}, "needs an observation with one picture, not 0"),
-        ({"reconstruction_coef": -1.0}, "--reconstruction-coef is -1.0; it must be a number from 0"),
+        ({"reconstruction_coef": -1.0}, "--reconstruction-coef is -1.0; it must be 0 or more"),
     ],
 )
 def test_heads_that_cannot_be(tiny, changes, message):

@@ -24,6 +24,7 @@ from selenium.webdriver.support.ui import Select, WebDriverWait
 import enjoy
 import ppo_gru
 import ppo_trxl
+from memory_gym_envs.making import parse_options
 
 AGENTS = {
     "GRU": (ppo_gru, {"env_id": "MysteryPath-Grid-v0", "reconstruction_coef": 0.1, "ground_truth_coef": 0.1}),
@@ -42,7 +43,7 @@ def saved(tiny):
     def save(script=ppo_gru, **changes):
         args = tiny(script, **{"env_id": "MysteryPath-Grid-v0", **changes})
         torch.manual_seed(1)
-        envs = script.make_envs(args, 1)
+        envs = script.environments(args, 1)
         _, infos = envs.reset(seed=1)
         agent = script.make_agent(envs, infos, args, torch.device("cpu"))
         with torch.no_grad():  # the initial policy hardly depends on its input
@@ -56,7 +57,7 @@ def saved(tiny):
 
 def played(seed=3, max_steps=60):
     agent, envs, args = enjoy.load("model.pt")
-    options = ppo_gru.reset_options(args.env_id, args.env_options)
+    options = parse_options(args.env_id, args.env_options)
     return enjoy.play(agent, envs, seed, options, max_steps)
 
 
@@ -108,20 +109,20 @@ def test_the_episode_is_the_agents(saved):
     view, truth = map(frames_of, page["videos"])
     torch.manual_seed(3)
     obs, infos = envs.reset(seed=3)
-    live = agent.memory.initial(60, 1, torch.device("cpu"))
+    memory, cpu = agent.memory.initial_state(1, 60, torch.device("cpu")), torch.device("cpu")
     for t, actions in enumerate(episode.actions):
-        assert np.array_equal(view[t], obs[0])
-        envs.render_mode = "debug_rgb_array"
+        assert np.array_equal(view[t], obs["observation"][0])
+        envs.unwrapped.render_mode = "debug_rgb_array"
         assert np.array_equal(truth[t], envs.render()[0])
         assert np.array_equal(episode.truth[t], infos["ground_truth"][0])
         with torch.no_grad():
-            looks = agent.memory.attention(agent.encoder(ppo_gru.as_tensors(obs)), live)[0]
-            policy, value, live, _ = agent.act(ppo_gru.as_tensors(obs), live)
+            looks = enjoy.attention_of(agent.memory, agent.encoder(ppo_gru.as_tensors(obs, cpu)), memory)[0]
+            taken, log_probs, value, memory = agent.act(ppo_gru.as_tensors(obs, cpu), memory)
         assert episode.values[t] == value.item()
-        assert np.array_equal(episode.policy[t][0], policy[0].probs[0].numpy())
+        assert episode.policy[t][0][actions[0]] == pytest.approx(log_probs.exp().item())
         assert np.array_equal(episode.attention[t], looks.numpy())
-        assert actions == [policy[0].sample().item()]
-        obs, rewards, terminated, truncated, infos = envs.step(np.array(actions))
+        assert taken.tolist() == [actions]
+        obs, rewards, terminated, truncated, infos = envs.step(taken.numpy())
         assert episode.rewards[t] == rewards[0]
         assert (terminated | truncated)[0] == (episode.finished and t == len(episode.actions) - 1)
     assert episode.finished

@@ -200,7 +200,7 @@ def test_a_curve_is_the_iqm_with_its_band(agents, scalars):
 def test_hyperparameters_are_those_of_the_run(agents):
     for folder in agents:
         script = ppo_trxl if "trxl" in folder else ppo_gru
-        args, _ = script.load_model(f"{folder}/model.pt")
+        args = script.saved_args(script.read_model(f"{folder}/model.pt"))
         text = {name: str(value) for name, value in asdict(args).items()}
         assert evaluate.hyperparameters(evaluate.read_run(folder)) == {"script": script.__name__} | text
 
@@ -244,15 +244,24 @@ def test_scores_are_those_of_the_levels(agents, capsys):
     assert low <= trxl["metrics"]["num_fails"]["iqm"] <= high
     assert f"| num_fails | ppo_trxl | 2 | {falls.mean():.3f} |" in said
 
-    args, _ = ppo_trxl.load_model(models[2])
+    saved = ppo_trxl.read_model(models[2])
+    args = ppo_trxl.saved_args(saved)
     args.eval_levels, args.eval_repeats = 4, 2
-    envs = ppo_trxl.make_envs(args, 8)
+    envs = ppo_trxl.environments(args, 8)
     agent = ppo_trxl.make_agent(envs, {}, args, torch.device("cpu"))
-    ppo_trxl.load_weights(agent, models[2])
+    ppo_trxl.load_weights(agent, saved, models[2])
     torch.manual_seed(1)
     found = ppo_trxl.evaluate(agent, envs, args)["num_fails"]
     assert falls[0].tolist() == [np.mean(found[2 * level : 2 * level + 2]) for level in range(4)]
     assert len(set(falls[0])) > 1, "levels that can be told apart"
+
+
+def test_a_checkpoint_is_read_once(agents, monkeypatch):
+    read, load = [], torch.load
+    monkeypatch.setattr(torch, "load", lambda file, **how: (read.append(file.name), load(file, **how))[1])
+    models = tuple(f"{folder}/model.pt" for folder in agents)
+    evaluate.main(evaluate.Config(models, max_steps=3, **FEW))
+    assert sorted(read) == sorted(models)
 
 
 def test_episodes_cut_short(agents, capsys):

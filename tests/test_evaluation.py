@@ -14,7 +14,7 @@ FEW = {"eval_levels": 3, "eval_repeats": 2, "num_levels": 10, "start_level": 5}
 
 
 def evaluated(script, args, run, seed=0, **changes):
-    envs = script.make_envs(args, len(script.evaluation_levels(args)))
+    envs = script.environments(args, len(script.evaluation_levels(args)))
     torch.manual_seed(seed)
     return script.evaluate(run.agent, envs, args, **changes)
 
@@ -33,10 +33,8 @@ def test_levels_follow_the_training_set(tiny, script):
 def test_a_lane_plays_its_level_once(played, script, monkeypatch):
     """The same actions in single environments with the levels' seeds earn the same."""
     args, run, *_ = played(script=script, env_id="MortarMayhemB-Grid-v0", **FEW)
-    actions, to_env_actions = [], script.to_env_actions
-    monkeypatch.setattr(
-        script, "to_env_actions", lambda *given: (actions.append(to_env_actions(*given)), actions[-1])[1]
-    )
+    taken, act = [], run.agent.act
+    monkeypatch.setattr(run.agent, "act", lambda *given: (taken.append(act(*given)), taken[-1])[1])
     found = evaluated(script, args, run)
     assert (found["finished"] == 1).all()
     for lane, level in enumerate(script.evaluation_levels(args)):
@@ -44,7 +42,7 @@ def test_a_lane_plays_its_level_once(played, script, monkeypatch):
         env.reset(seed=level)
         rewards, ended = [], False
         while not ended:
-            _, reward, terminated, truncated, info = env.step(actions[len(rewards)][lane])
+            _, reward, terminated, truncated, info = env.step(int(taken[len(rewards)][0][lane, 0]))
             rewards.append(reward)
             ended = terminated or truncated
         assert found["return"][lane] == pytest.approx(sum(rewards))
@@ -104,12 +102,21 @@ def test_other_environments_are_evaluated_too(tiny, scalars):
 def test_the_minor_baselines_observe_and_train(tiny, scalars, script, changes, shape):
     """6.2.1, and vectors: what is observed is trained on, evaluated and saved."""
     args = tiny(script, eval_interval=2, **FEW, **changes, eval_max_steps=5)
-    envs = script.make_envs(args, 2)
-    parts = {name: part.shape for name, part in script.observation_spaces(envs.single_observation_space).items()}
+    envs = script.environments(args, 2)
+    parts = {name: part.shape for name, part in envs.single_observation_space.items()}
     assert shape is None or parts == shape
     assert len(scalars(script.main(args))["eval/return"]) == 1
 
 
-def test_only_memory_gym_has_vectors_to_choose(tiny):
-    with pytest.raises(ValueError, match="--obs-type is of Memory Gym environments; CartPole-v1 has one kind"):
-        ppo_gru.setup(tiny(env_id="CartPole-v1", obs_type="vector"))
+@SCRIPTS
+def test_an_episode_that_outlasts_the_memory_costs_the_evaluation_alone(tiny, scalars, script, monkeypatch, capsys):
+    args = tiny(script, env_id="CueRecall-v0", eval_interval=1, **FEW)
+
+    def outlasted(*_):
+        raise script.MemoryLimit("--trxl-pe-length is 5, but an episode is longer")
+
+    monkeypatch.setattr(script, "evaluate", outlasted)
+    curves = scalars(script.main(args))
+    assert len(curves["losses/loss"]) == 2
+    assert "eval/return" not in curves
+    assert capsys.readouterr().err.count("no evaluation: --trxl-pe-length is 5, but an episode is longer") == 2

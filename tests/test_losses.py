@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from ppo_gru import anneal, draw, explained_variance, minibatch_loss, policy_loss, value_loss
+from ppo_gru import UniqueObservations, anneal, explained_variance, policy_loss, ppo_loss, value_loss
 
 
 def test_policy_loss_clips_every_branch_by_itself():
@@ -54,23 +54,13 @@ def test_the_total_loss_is_composed_as_in_equation_5_7(played):
             parameter.zero_()
         rollout.log_probs.fill_(math.log(0.5))  # what this uniform policy would have stored
     pieces = agent.memory.cut(rollout.terminated)
-    targets = rollout.rewards + 1, rollout.rewards
-    loss, logs = minibatch_loss(agent, rollout, targets, pieces, 5.0, args)
-    assert logs["losses/entropy"].item() == pytest.approx(2 * math.log(2)), "the sum over both branches"
-    assert logs["losses/policy_loss"].item() == pytest.approx(-targets[0].mean().item())
-    parts = logs["losses/policy_loss"] + 3.0 * logs["losses/value_loss"] - 5.0 * logs["losses/entropy"]
+    rollout.advantages, rollout.returns = rollout.rewards + 1, rollout.rewards
+    observations = UniqueObservations(rollout.obs, agent)
+    loss, logs = ppo_loss(agent, rollout, observations, pieces, 5.0, args)
+    assert logs["entropy"].item() == pytest.approx(2 * math.log(2)), "the sum over both branches"
+    assert logs["policy_loss"].item() == pytest.approx(-rollout.advantages.mean().item())
+    parts = logs["policy_loss"] + 3.0 * logs["value_loss"] - 5.0 * logs["entropy"]
     assert loss.item() == pytest.approx(parts.item())
-    normalized = minibatch_loss(agent, rollout, targets, pieces, 5.0, dataclasses.replace(args, norm_adv=True))[1]
-    assert normalized["losses/policy_loss"].item() == pytest.approx(0.0, abs=1e-5), "advantages of mean zero"
-
-
-def test_actions_are_drawn_as_the_library_draws_them():
-    """With the same generator to the last bit, and as often as they should be."""
-    torch.manual_seed(0)
-    policy = [torch.distributions.Categorical(logits=torch.randn(5000, actions)) for actions in (3, 4)]
-    torch.manual_seed(1)
-    actions = draw(policy)
-    torch.manual_seed(1)
-    assert actions.equal(torch.stack([branch.sample() for branch in policy], -1))
-    share = torch.nn.functional.one_hot(actions[:, 1]).float().mean(0)
-    torch.testing.assert_close(share, policy[1].probs.mean(0), atol=0.02, rtol=0)
+    normalize = dataclasses.replace(args, norm_adv=True)
+    normalized = ppo_loss(agent, rollout, observations, pieces, 5.0, normalize)[1]
+    assert normalized["policy_loss"].item() == pytest.approx(0.0, abs=1e-5), "advantages of mean zero"

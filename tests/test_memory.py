@@ -1,14 +1,12 @@
 """The invariants of a memory: what the update recomputes is what the rollout saw, and nothing leaks."""
 
 import contextlib
-import dataclasses
 import math
 
 import numpy as np
 import pytest
 import torch
 from conftest import SMALL
-from gymnasium.vector import AutoresetMode
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -34,11 +32,17 @@ def recompute(run):
     """Evaluate the whole rollout in one batch of pieces; return the pieces' steps, ratios and values."""
     rollout = run.rollout
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
-    steps = pieces.steps()
-    obs = {name: part.flatten(0, 1)[steps] for name, part in rollout.obs.items()}
-    policy, values, _ = run.agent.unroll(obs, None, pieces, rollout.memory)
-    log_probs = ppo_gru.log_probs_of(policy, rollout.actions.flatten(0, 1)[steps])
-    return steps, (log_probs - rollout.log_probs.flatten(0, 1)[steps]).exp(), values
+    index = pieces.flat_index()
+    obs = {name: part.flatten(0, 1)[index] for name, part in rollout.obs.items()}
+    actions, which = rollout.actions.flatten(0, 1)[index], torch.arange(len(index))
+    log_probs, _, values, _ = run.agent.evaluate_actions(obs, which, actions, pieces, rollout.memory)
+    return index, (log_probs - rollout.log_probs.flatten(0, 1)[index]).exp(), values
+
+
+def loss_of(script, args, run, pieces, ent_coef=1e-3):
+    """The loss of the pieces, and what it logs."""
+    observations = script.UniqueObservations(run.rollout.obs, run.agent)
+    return script.ppo_loss(run.agent, run.rollout, observations, pieces, ent_coef, args)
 
 
 @pytest.mark.parametrize("env_id", ["CueRecall-v0", "MortarMayhemB-Grid-v0", "Endless-MortarMayhem-v0"])
@@ -47,9 +51,9 @@ def test_ratio_is_one_for_every_sample(played, env_id, memory):
     # Three rollouts of 16 steps: episodes end inside them and go on from one to the next.
     _, run, *_ = played(iterations=3, weights_scale=3.0, env_id=env_id, **memory)
     rollout = run.rollout
-    steps, ratio, values = recompute(run)
+    index, ratio, values = recompute(run)
     assert (ratio - 1).abs().max() < 1e-5
-    played_values = rollout.values.flatten(0, 1)[steps]  # up to 15, as the heads' weights were scaled up
+    played_values = rollout.values.flatten(0, 1)[index]  # up to 15, as the heads' weights were scaled up
     assert (values - played_values).abs().max() < 1e-5 * played_values.abs().max().clamp(min=1)
     if env_id == "CueRecall-v0":
         assert rollout.terminated.any()
@@ -81,15 +85,15 @@ def test_ratio_is_nearly_one_when_compiled(played, script):
 def test_ratio_error_sees_a_broken_memory(played, memory):
     """Guards the guard: with what the memory stored lost, the ratios are off."""
     _, run, *_ = played(iterations=3, weights_scale=3.0, env_id="CueRecall-v0", **memory)
-    stored = run.rollout.memory
-    (stored if memory in RECURRENT else stored.items).zero_()
+    state = run.rollout.memory
+    (state.stored if memory in RECURRENT else state.items).zero_()
     assert (recompute(run)[1] - 1).abs().max() > 1e-4
 
 
 @pytest.mark.parametrize("memory", MEMORIES)
 def test_bootstrap_value_is_the_next_step_s_value(played, memory):
     args, run, last_value, _ = played(iterations=2, env_id="CueRecall-v0", **memory)
-    memory.get("script", ppo_gru).collect(run.agent, run.envs, run.play, run.rollout, args, None)
+    memory.get("script", ppo_gru).collect(run.agent, run.envs, run.rollout, args)
     torch.testing.assert_close(run.rollout.values[0], last_value, atol=1e-6, rtol=0)
 
 
@@ -98,9 +102,10 @@ def test_an_episode_begins_with_an_empty_memory(played, memory):
     rollout = played(env_id="CueRecall-v0", **memory)[1].rollout
     begins = rollout.terminated[:-1]
     assert begins.any()
-    assert (rollout.memory[1:][begins] == 0).all()
-    assert (rollout.memory[1:][~begins].abs().sum((-1, -2)) > 0).all(), "and goes on where none ended"
-    assert (rollout.memory[0] == 0).all()
+    stored = rollout.memory.stored
+    assert (stored[1:-1][begins] == 0).all()
+    assert (stored[1:-1][~begins].abs().sum((-1, -2)) > 0).all(), "and goes on where none ended"
+    assert (stored[0] == 0).all()
 
 
 def gradients(agent):
@@ -113,13 +118,13 @@ def test_padding_changes_nothing(played, memory, fill, monkeypatch):
     args, run, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
     run.agent.memory.packed = False  # as on a GPU; packed pieces have no padding
     rollout = run.rollout
-    targets = rollout.rewards - rollout.values, rollout.rewards
+    rollout.advantages, rollout.returns = rollout.rewards - rollout.values, rollout.rewards
 
     def learn():
         pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
         assert pieces.length.min() < pieces.length.max(), "there is padding"
         run.agent.zero_grad()
-        loss, _ = ppo_gru.minibatch_loss(run.agent, rollout, targets, pieces, 1e-3, args)
+        loss, _ = loss_of(ppo_gru, args, run, pieces)
         loss.backward()
         return recompute(run)[1:], loss.detach(), gradients(run.agent)
 
@@ -154,9 +159,9 @@ def test_gru_equals_a_loop_over_cells():
     memory = ppo_gru.Memory(ppo_gru.Args(hidden_size=8)).double()
     cell = torch.nn.GRUCell(8, 8).double()
     cell.load_state_dict({name.removesuffix("_l0"): value for name, value in memory.rnn.state_dict().items()})
-    x, live = torch.randn(3, 6, 8).double(), torch.randn(3, 1, 8).double()
-    y, after = memory.recur(x, live)
-    h = live[:, 0]
+    x, hidden = torch.randn(3, 6, 8).double(), torch.randn(3, 1, 8).double()
+    y, after = memory.recur(x, hidden)
+    h = hidden[:, 0]
     for t in range(6):
         h = cell(x[:, t], h)
         torch.testing.assert_close(y[:, t], h, atol=1e-12, rtol=0)
@@ -166,56 +171,59 @@ def test_gru_equals_a_loop_over_cells():
 @pytest.mark.parametrize("memory", TRANSFORMER)
 def test_an_episode_s_first_step_is_the_same_whatever_came_before(played, memory):
     _, run, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
-    agent, live = run.agent, run.play.live
+    agent, state = run.agent, run.rollout.memory
     obs = {"observation": torch.randn(4, 3)}
-    fresh = agent.act(obs, agent.memory.initial(16, 4, torch.device("cpu")))[1]
-    forgotten = agent.memory.reset(live, torch.tensor([True, True, True, False]))
-    values = agent.act(obs, forgotten)[1]
+    with torch.no_grad():
+        fresh = agent.get_value(obs, agent.memory.initial_state(4, 16, torch.device("cpu")))
+        forgotten = agent.memory.reset(state, torch.tensor([True, True, True, False]))
+        values = agent.get_value(obs, forgotten)
     torch.testing.assert_close(values[:3], fresh[:3], atol=1e-6, rtol=0)
     assert (values[3] - fresh[3]).abs() > 1e-6
 
 
-def test_the_encoder_sees_each_step_once_an_epoch_and_no_padding(played, monkeypatch):
-    args, run, last_value, _ = played(env_id="CueRecall-v0")
+@pytest.mark.parametrize("packed", [True, False])
+def test_the_encoder_sees_each_step_once_an_epoch_and_no_padding(played, monkeypatch, packed):
+    args, run, *_ = played(env_id="CueRecall-v0")
     rows, runs = [], []
+    run.agent.memory.packed = packed
     run.agent.encoder.register_forward_pre_hook(lambda _, inputs: rows.append(len(inputs[0]["observation"])))
-    for way in ("recur", "scan"):
-        unroll = getattr(run.agent.memory, way)
-        monkeypatch.setattr(run.agent.memory, way, lambda *given, unroll=unroll: (runs.append(1), unroll(*given))[1])
-    ppo_gru.update(run.agent, run.learn, run.rollout, last_value, 0.0, args)
+    owner, way = (ppo_gru, "packed_gru") if packed else (run.agent.memory, "recur")
+    unroll = getattr(owner, way)
+    monkeypatch.setattr(owner, way, lambda *given: (runs.append(1), unroll(*given))[1])
+    ppo_gru.update(run.agent, run.optimizer, run.rollout, 0.0, args)
     assert sum(rows) == args.update_epochs * args.num_envs * args.num_steps
     assert len(runs) == args.update_epochs * args.num_minibatches, "all pieces of a minibatch at once"
     rows.clear()
-    ppo_gru.collect(run.agent, run.envs, run.play, run.rollout, args, None)
+    ppo_gru.collect(run.agent, run.envs, run.rollout, args)
     assert rows == [args.num_envs] * (args.num_steps + 1), "no loop over lanes"
 
 
 @pytest.mark.parametrize("env_id", ["MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"])
-def test_what_was_observed_before_is_encoded_once(played, env_id):
-    """The same gradient as from every step's own observation, whose equals are found in all of its parts."""
+def test_equal_observations_are_encoded_once(played, env_id):
+    """The same gradient as from every step's own observation; equal ones are so in all of their parts."""
     args, run, *_ = played(env_id=env_id, num_steps=32, reconstruction_coef=0.1)
     rollout, rows = run.rollout, []
-    obs = [part.flatten(0, 1).flatten(1) for part in rollout.obs.values()]
-    equal = torch.stack([(part[:, None] == part).all(-1) for part in obs]).all(0)  # (R, R)
-    assert torch.equal(rollout.alike, equal.int().argmax(-1))
-    distinct = len(rollout.alike.unique())
-    assert distinct < 0.6 * len(rollout.alike)
+    unique = ppo_gru.UniqueObservations(rollout.obs, run.agent)
+    obs = [part.flatten(1) for part in unique.obs.values()]
+    equal = torch.stack([(part[:, None] == part).all(-1) for part in obs]).all(0)  # (B, B)
+    assert torch.equal(unique.first_occurrence, equal.int().argmax(-1))
+    distinct = len(unique.first_occurrence.unique())
+    assert distinct < 0.6 * len(unique.first_occurrence)
     run.agent.encoder.register_forward_pre_hook(lambda _, inputs: rows.append(len(next(iter(inputs[0].values())))))
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
-    targets, found = 2 * (torch.randn(32, 4),), []
-    for alike in (rollout.alike, None):
+    rollout.advantages, rollout.returns, found = *(2 * (torch.randn(32, 4),)), []
+    for _ in range(2):
         run.agent.zero_grad()
-        loss, _ = ppo_gru.minibatch_loss(
-            run.agent, dataclasses.replace(rollout, alike=alike), targets, pieces, 1e-3, args
-        )
+        loss, _ = ppo_gru.ppo_loss(run.agent, rollout, unique, pieces, 1e-3, args)
         loss.backward()
         found.append((loss.detach(), gradients(run.agent)))
-    assert rows == [distinct, len(rollout.alike)]
+        unique.first_occurrence = None
+    assert rows == [distinct, 128]
     torch.testing.assert_close(found[0], found[1], atol=1e-6, rtol=1e-4)
 
 
 def test_a_long_episode_takes_no_more_memory_than_a_short_one(played):
-    """5,000 steps of endless episodes: the same storage, bytes for pixels, a live memory of the same size."""
+    """5,000 steps of endless episodes: the same storage, bytes for pixels, a hidden state of the same size."""
     changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"explosion_delay": [1000]}', "hidden_size": 4}
     args, run, *_ = played(num_envs=1, num_steps=50, num_minibatches=1, **changes)
 
@@ -226,27 +234,28 @@ def test_a_long_episode_takes_no_more_memory_than_a_short_one(played):
     before = storage()
     assert before["observation"][1:] == ((50, 1, 84, 84, 3), torch.uint8)
     for _ in range(99):
-        ppo_gru.collect(run.agent, run.envs, run.play, run.rollout, args, None)
-    assert run.play.lengths[0] > 900
+        ppo_gru.collect(run.agent, run.envs, run.rollout, args)
+    assert run.envs.episode_lengths[0] > 900
     assert storage() == before
-    assert run.play.live.shape == (1, 1, 4)
+    assert run.rollout.memory.hidden.shape == (1, 1, 4)
 
 
 def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(played):
     """5,000 steps of one endless episode, far beyond the window and the encodings' usual length."""
     changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"explosion_delay": [1000]}'}
     args, run, *_ = played(script=ppo_trxl, num_envs=1, num_steps=50, num_minibatches=1, **changes)
-    run.play.live.steps.add_(4050)  # as if the episode had been going on for long; its window is still that of 50 steps
+    # As if the episode had been going on for long; its window is still that of 50 steps.
+    run.rollout.memory.episode_step.add_(4050)
 
     def storage():
-        live, stored = run.play.live, run.rollout.memory
-        return [(part.data_ptr(), part.shape) for part in (live.keys, live.values, stored.items, stored.steps)]
+        state = run.rollout.memory
+        return [(part.data_ptr(), part.shape) for part in (state.keys, state.values, state.items, state.item_steps)]
 
     before = storage()
     for _ in range(19):
-        ppo_trxl.collect(run.agent, run.envs, run.play, run.rollout, args, None)
+        ppo_trxl.collect(run.agent, run.envs, run.rollout, args)
         assert recompute(run)[1].sub(1).abs().max() < 1e-5
-    assert run.play.live.steps > 5000
+    assert run.rollout.memory.episode_step > 5000
     assert storage() == before
 
 
@@ -258,63 +267,53 @@ def test_truncation_bootstraps_with_the_final_observation_and_the_memory_before_
     assert not rollout.terminated.any()
     assert (rollout.truncation_values != 0).equal(rollout.truncated)
     # The same actions played again: the final observation, and the memory that five steps left behind.
-    live = torch.zeros_like(rollout.memory[0])
-    for t in range(5):
-        *_, live, _ = run.agent.act({"observation": rollout.obs["observation"][t]}, live)
-    envs = ppo_gru.make_envs(args, args.num_envs)
-    ppo_gru.first_reset(envs, args.seed, {"max_steps": 5})
-    for t in range(5):
-        *_, infos = envs.step(rollout.actions[t].numpy())
-    final = {"observation": torch.from_numpy(np.stack(infos["final_obs"]))}
-    torch.testing.assert_close(rollout.truncation_values[4], run.agent.act(final, live)[1].detach(), atol=1e-6, rtol=0)
+    state, options = run.agent.memory.initial_state(4, 16, torch.device("cpu")), {"max_steps": 5}
+    envs = ppo_gru.environments(args, args.num_envs, seed=args.seed, options=options)
+    envs.reset(options=options)
+    with torch.no_grad():
+        for t in range(5):
+            *_, state = run.agent.act({"observation": rollout.obs["observation"][t]}, state)
+            *_, infos = envs.step(rollout.actions[t].numpy())
+        final = {"observation": torch.from_numpy(np.stack([obs["observation"] for obs in infos["final_obs"]]))}
+        value = run.agent.get_value(final, state)
+    torch.testing.assert_close(rollout.truncation_values[4], value, atol=1e-6, rtol=0)
     assert (played(**changes)[1].rollout.truncation_values == 0).all()
 
 
-def test_update_hands_the_rollout_to_gae(played, monkeypatch):
-    args, run, last_value, _ = played(env_id="CueRecall-v0", gamma=0.9, gae_lambda=0.8)
-    seen = {}
-    gae = ppo_gru.gae
+def test_training_hands_the_rollout_to_gae(tiny, monkeypatch):
+    args = tiny(env_id="CueRecall-v0", gamma=0.9, gae_lambda=0.8, total_timesteps=64)
+    run = ppo_gru.setup(args)
+    seen, learned = {}, {}
+    gae, update = ppo_gru.gae, ppo_gru.update
     monkeypatch.setattr(ppo_gru, "gae", lambda **given: (seen.update(given), gae(**given))[1])
-    ppo_gru.update(run.agent, run.learn, run.rollout, last_value, 0.0, args)
+    monkeypatch.setattr(ppo_gru, "update", lambda *given: (learned.update(vars(given[2])), update(*given))[1])
+    ppo_gru.train(args, run)
     names = ("rewards", "values", "terminated", "truncated", "truncation_values")
     assert all(seen[name] is getattr(run.rollout, name) for name in names)
-    assert (seen["last_value"] is last_value, seen["gamma"], seen["gae_lambda"]) == (True, 0.9, 0.8)
-
-
-def test_an_environment_that_resets_in_the_next_step_is_refused(tiny, monkeypatch):
-    envs = ppo_gru.gym.make_vec("CueRecall-v0", 4, vectorization_mode="sync")
-    monkeypatch.setattr(ppo_gru, "make_envs", lambda *_: envs)
-    with pytest.raises(ValueError, match="does not reset an ended episode in the same step"):
-        ppo_gru.setup(tiny(env_id="CueRecall-v0"))
-
-
-def test_autoreset_is_in_the_same_step():
-    for env_id in ("MortarMayhem-Grid-v0", "CueRecall-v0", "CartPole-v1"):
-        envs = ppo_gru.make_envs(ppo_gru.Args(env_id=env_id), 2)
-        assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
-        envs.close()
+    assert (seen["gamma"], seen["gae_lambda"]) == (0.9, 0.8)
+    assert learned["advantages"].equal(gae(**seen))
+    assert learned["returns"].equal(gae(**seen) + run.rollout.values)
 
 
 @pytest.mark.parametrize("layers", [1, 2])
-def test_the_gru_learns_as_the_library_s(layers):
-    ours, library = (of(5, 5, layers, batch_first=True).double() for of in (ppo_gru.GRU, nn.GRU))
-    ours.load_state_dict(library.state_dict())
-    found = []
-    for gru in (ours, library):
+def test_the_packed_gru_learns_as_the_library_s(layers):
+    gru, found = nn.GRU(5, 5, layers, batch_first=True).double(), []
+    lengths = [3, 9, 1, 9, 4]
+    pieces = ppo_gru.Pieces(torch.zeros(5, dtype=torch.int64), torch.tensor(lengths), 1)
+    for ours in (True, False):
         generator = torch.Generator().manual_seed(3)
-        shapes = [(length, 5) for length in (3, 9, 1, 9, 4)] + [(layers, 5, 5), (26, 5)]
-        *pieces, state, wanted = (
+        shapes = [(sum(lengths), 5), (5, layers, 5), (sum(lengths), 5)]
+        x, hidden, wanted = (
             torch.randn(shape, dtype=torch.float64, generator=generator, requires_grad=True) for shape in shapes
         )
-        packed = nn.utils.rnn.pack_sequence(pieces, enforce_sorted=False)
-        if gru is ours:  # whose states are in the packed order
-            y = gru.scan(packed.data, state[:, packed.sorted_indices], packed.batch_sizes.tolist())
-            y = packed._replace(data=y)
+        gru.zero_grad()
+        if ours:
+            y = ppo_gru.packed_gru(gru, x, pieces, hidden)
         else:
-            y, _ = gru(packed, state)
-        y = torch.cat(nn.utils.rnn.unpack_sequence(y))
+            packed = nn.utils.rnn.pack_sequence(x.split(lengths), enforce_sorted=False)
+            y = torch.cat(nn.utils.rnn.unpack_sequence(gru(packed, hidden.transpose(0, 1).contiguous())[0]))
         (y * wanted).sum().backward()
-        found.append([y, state.grad, *(piece.grad for piece in pieces), *(weight.grad for weight in gru.parameters())])
+        found.append([y, hidden.grad, x.grad, *(weight.grad.clone() for weight in gru.parameters())])
     for got, want in zip(*found, strict=True):
         torch.testing.assert_close(got, want, rtol=0, atol=1e-12)
 
@@ -327,49 +326,41 @@ def test_packed_or_padded_is_the_same(played):
         torch.testing.assert_close(got, want, rtol=0, atol=1e-6)
 
 
-def moved(part, device):
-    """A copy on the device of what is on a GPU when there is one."""
-
-    def move(leaf):
-        if isinstance(leaf, ppo_trxl.Timeline):
-            return ppo_trxl.Timeline(leaf.items.to(device), leaf.steps.to(device))
-        return leaf.to(device) if isinstance(leaf, torch.Tensor) else leaf
-
-    return ppo_gru.each_leaf(move, part)
-
-
-class OneDevice(TorchDispatchMode):
-    """Fails where numbers go from the CPU to another device or back."""
+class NoQuestions(TorchDispatchMode):
+    """Fails where the CPU asks the other device for numbers; what goes to it is counted by the operation."""
 
     def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
         found = operation(*args, **(kwargs or {}))
-        devices = {x.device.type for x in tree_leaves((args, kwargs, found)) if isinstance(x, torch.Tensor)}
-        assert len(devices) < 2, f"{operation} is given or returns tensors of {devices}"
+        given, made = ({x.device.type for x in tree_leaves(y) if isinstance(x, torch.Tensor)} for y in (args, found))
+        assert not ("meta" in given and "cpu" in made), f"{operation} brings numbers back from {given}"
         return found
 
 
 @pytest.mark.parametrize("memory", MEMORIES)
-def test_playing_and_learning_wait_for_no_device(played, monkeypatch, memory):
-    """On the meta device, which has shapes and no numbers: whatever asked it for one would fail, as would a mixture.
-
-    Nothing is copied to it either, except where the pieces' lengths differ from minibatch to minibatch.
-    """
+def test_acting_and_learning_ask_no_device_for_numbers(played, monkeypatch, memory):
+    """On the meta device, which has shapes and no numbers: whatever asked it for one would fail."""
     heads = {"reconstruction_coef": 0.1, "ground_truth_coef": 0.1}
     script = memory.get("script", ppo_gru)
     args, run, *_ = played(env_id="MortarMayhemB-Grid-v0", iterations=2, **heads, **memory)
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())  # knows no such device
-    pieces = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated)
-    agent = run.agent.to("meta")
-    rollout = script.Rollout(**moved(vars(run.rollout) | {"alike": None}, "meta"))
-    live, obs = moved(run.play.live, "meta"), {name: part[0] for name, part in rollout.obs.items()}
-    if memory.get("trxl_positional_encoding") != "learned":  # it asks whether its table goes on
-        with OneDevice(), torch.no_grad():
-            agent.choose(obs, live)
-    targets, ent_coef = 2 * (torch.zeros(16, 4, device="meta"),), torch.ones((), device="meta")
-    optimizer = torch.optim.SGD(agent.parameters())
+    pieces, agent = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated), run.agent.to("meta")
+    on_cpu = {"episode_step", "item_steps"}  # of the transformer's memory: what shapes depend on
+
+    def moved(part):
+        return part.to("meta") if isinstance(part, torch.Tensor) else part
+
+    state = run.rollout.memory
+    state = state._replace(**{name: moved(part) for name, part in state._asdict().items() if name not in on_cpu})
+    parts = {name: moved(part) for name, part in vars(run.rollout).items()}
+    rollout = script.Rollout(**parts | {"obs": {k: v.to("meta") for k, v in run.rollout.obs.items()}, "memory": state})
+    obs = {name: part[0] for name, part in rollout.obs.items()}
+    with NoQuestions(), torch.no_grad():
+        state = agent.memory.begin_rollout(state)
+        agent.get_value(obs, state)
+    observations = script.UniqueObservations(rollout.obs, agent)
     for minibatch in pieces.minibatches(2):
-        first, lengths = minibatch.first.to("meta"), tuple(minibatch.length.tolist())
-        with OneDevice() if minibatch.even() else contextlib.nullcontext():
-            script.descend(agent, optimizer, rollout, args, first, lengths, targets, ent_coef)
-    assert minibatch.even() == (memory not in RECURRENT and "trxl_segment_length" not in memory)  # 16 is no 3 x 5
+        with NoQuestions():
+            loss, _ = script.ppo_loss(agent, rollout, observations, minibatch, 1e-3, args)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(agent.parameters(), 1.0)
     assert all(parameter.grad.device.type == "meta" for parameter in agent.parameters())

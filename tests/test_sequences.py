@@ -5,7 +5,7 @@ import torch
 
 from ppo_gru import Args, Memory, Pieces
 
-# Lane 0 ends an episode at step 2, lane 1 at steps 0 and 4 (the rollout's last).
+# Environment 0 ends an episode at step 2, environment 1 at steps 0 and 4 (the rollout's last).
 DONE = torch.tensor([[0, 1], [0, 0], [1, 0], [0, 0], [0, 1]], dtype=torch.bool)
 
 
@@ -29,9 +29,22 @@ def test_without_memory_every_step_is_a_piece():
     assert pieces_of(memory, DONE) == [(t * 2 + n, 1) for n in (0, 1) for t in range(5)]
 
 
-def test_steps_are_the_pieces_steps_in_order():
-    steps = Pieces(torch.tensor([6, 1, 3]), torch.tensor([2, 1, 4]), lanes=2).steps()
-    assert steps.tolist() == [6, 8, 1, 3, 5, 7, 9]
+def test_flat_index_lists_the_pieces_steps_in_order():
+    pieces = Pieces(torch.tensor([6, 1, 3]), torch.tensor([2, 1, 4]), num_envs=2)
+    assert pieces.flat_index().tolist() == [6, 8, 1, 3, 5, 7, 9]
+
+
+def test_the_drawn_example():
+    """What the docstring of Pieces draws."""
+    done = torch.zeros(5, 2, dtype=torch.bool)
+    done[2, 0] = True
+    pieces = Memory(Args(hidden_size=4)).cut(done)
+    assert (pieces.first.tolist(), pieces.length.tolist()) == ([0, 6, 1], [3, 2, 5])
+    assert pieces.flat_index().tolist() == [0, 2, 4, 6, 8, 1, 3, 5, 7, 9]
+    x = pieces.flat_index()[:, None].float() + 1
+    padded = pieces.pad(x)
+    assert padded[..., 0].tolist() == [[1, 3, 5, 0, 0], [7, 9, 0, 0, 0], [2, 4, 6, 8, 10]]
+    assert pieces.unpad(padded).equal(x)
 
 
 @pytest.mark.parametrize("seq_len", [0, 1, 7, 500])
@@ -40,13 +53,13 @@ def test_minibatches_deal_every_step_once(seq_len):
     done = torch.rand(64, 8) < 0.05
     pieces = Memory(Args(hidden_size=4, seq_len=seq_len)).cut(done)
     minibatches = list(pieces.minibatches(4))
-    steps = torch.cat([minibatch.steps() for minibatch in minibatches])
+    steps = torch.cat([minibatch.flat_index() for minibatch in minibatches])
     assert sorted(steps.tolist()) == list(range(64 * 8))
     sizes = [int(minibatch.length.sum()) for minibatch in minibatches]
     assert max(sizes) - min(sizes) <= 2 * pieces.length.max()
     assert pieces.length.max() <= (seq_len or 64)
     order = [minibatch.first.tolist() for minibatch in pieces.minibatches(4)]
-    assert order != [minibatch.first.tolist() for minibatch in minibatches], "the pieces are shuffled anew"
+    assert order != [minibatch.first.tolist() for minibatch in minibatches], "the pieces are shuffled again"
 
 
 def test_no_minibatch_is_empty_at_the_limit_of_check_args():
@@ -68,12 +81,10 @@ def test_padded_length_is_the_longest_piece(seq_len, monkeypatch):
     memory.packed = False  # packed pieces have no padding
     seen = []
     recur = memory.recur
-    monkeypatch.setattr(memory, "recur", lambda x, live: (seen.append(x.shape), recur(x, live))[1])
+    monkeypatch.setattr(memory, "recur", lambda x, hidden: (seen.append(x.shape), recur(x, hidden))[1])
     done = torch.zeros(32, 3, dtype=torch.bool)
     done[[4, 20]] = True
     pieces = memory.cut(done)
-    y = memory.unroll(torch.randn(96, 4), pieces, torch.zeros(32, 3, 1, 4))
+    y = memory.unroll(torch.randn(96, 4), pieces, memory.initial_state(3, 32, torch.device("cpu")))
     assert seen == [(len(pieces.length), seq_len or 16, 4)], "the recurrent layers run once, padded no further"
     assert y.shape == (96, 4)
-    padding = 1 - 96 / (len(pieces.length) * (seq_len or 16))
-    assert memory.numbers(pieces, torch.empty(0))["padding_fraction"] == pytest.approx(padding)

@@ -7,8 +7,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-import ppo_trxl
-from ppo_trxl import Args, Attention, Memory, Timeline, sinusoid, visible
+from enjoy import attention_of, attention_weights
+from ppo_trxl import Args, Attention, Memory, sinusoid, visible
 
 ENCODINGS = ["absolute", "learned", "relative", "none"]
 STEPS, LANES, WIDTH = 24, 3, 8
@@ -24,33 +24,34 @@ def make_memory(**changes):
     return memory
 
 
-def in_double(live):
-    """The live memory with its cache in float64."""
-    return live._replace(keys=live.keys.double(), values=live.values.double())
+def fresh(memory, num_envs=LANES, num_steps=STEPS):
+    """The memory of fresh episodes in float64."""
+    state = memory.initial_state(num_envs, num_steps, torch.device("cpu"))
+    return state._replace(**{name: getattr(state, name).double() for name in ("items", "keys", "values")})
 
 
 def make_timeline(memory, seed=1):
-    """Random items, and the steps of episodes that end at random; in lane 0 one also ends before the rollout."""
+    """Random items, and the steps of episodes that end at random; in environment 0 one also ends before the rollout."""
     generator = torch.Generator().manual_seed(seed)
-    rows = memory.window + STEPS
+    rows = memory.window + STEPS + 1
     items = torch.randn(rows, LANES, len(memory.blocks), WIDTH, dtype=torch.float64, generator=generator)
     ends = torch.rand(rows, LANES, generator=generator) < 0.15
     ends[memory.window, 0] = True
     steps = torch.zeros(rows, LANES, dtype=torch.int64)
     for row in range(1, rows):
         steps[row] = (steps[row - 1] + 1).masked_fill(ends[row], 0)
-    return Timeline(items, steps)
+    return fresh(memory)._replace(now=memory.window + STEPS, items=items, item_steps=steps)
 
 
 def naive(memory, x, row, lane, stored):
     """One sample: gather its window, project it, attend with a softmax that is written out."""
-    step = int(stored.steps[row, lane])
+    step = int(stored.item_steps[row, lane])
     window = min(step, memory.window)
     at = torch.arange(row - window, row)
-    told = memory.query_encoding(stored.steps[row, lane], x.dtype)
+    told = memory.query_encoding(stored.item_steps[row, lane], x.dtype)
     for k, block in enumerate(memory.blocks):
         attention = block.attention
-        items = stored.items[at, lane, k] + memory.position(stored.steps[at, lane], x.dtype)
+        items = stored.items[at, lane, k] + memory.position(stored.item_steps[at, lane], x.dtype)
         normed, query = block.norm_items(items), block.norm_query(x + (told if k == 0 else 0.0))
         heads, size = [], WIDTH // attention.heads
         for h in range(attention.heads):
@@ -74,22 +75,15 @@ VARIANTS = [
 ] + [{"trxl_positional_encoding": encoding, "trxl_query_position": True} for encoding in ENCODINGS]
 
 
-@pytest.fixture(params=["as on a CPU", "as on a GPU"])
-def shapes(request, monkeypatch):
-    """The window reaches back to the oldest episode's first step, or has one length."""
-    if request.param == "as on a GPU":
-        monkeypatch.setattr(ppo_trxl, "shapes_may_vary", lambda device: False)
-
-
 @pytest.mark.parametrize("changes", VARIANTS)
-def test_unroll_equals_a_window_gathered_for_every_sample(changes, shapes):
+def test_unroll_equals_a_window_gathered_for_every_sample(changes):
     memory = make_memory(**changes)
     stored = make_timeline(memory)
     order = torch.randperm(LANES * math.ceil(STEPS / 8), generator=torch.Generator().manual_seed(2))
     pieces = memory.cut(torch.zeros(STEPS, LANES, dtype=torch.bool))
     pieces.first, pieces.length = pieces.first[order[:7]], pieces.length[order[:7]]
     pieces.length[2] = 3  # padding
-    flat = pieces.steps().tolist()
+    flat = pieces.flat_index().tolist()
     x = torch.randn(len(flat), WIDTH, dtype=torch.float64, requires_grad=True)
     wanted = torch.stack(
         [naive(memory, x[i], memory.window + at // LANES, at % LANES, stored) for i, at in enumerate(flat)]
@@ -105,31 +99,29 @@ def test_unroll_equals_a_window_gathered_for_every_sample(changes, shapes):
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("window", [3, 40])
-def test_playing_equals_unrolling(encoding, window, shapes):
-    """Three rollouts, refreshed in between: an episode of lane 0 spans them all, others end inside them."""
+def test_playing_equals_unrolling(encoding, window):
+    """Three rollouts: an episode of environment 0 spans them all, others end inside them."""
     memory = make_memory(trxl_positional_encoding=encoding, trxl_memory_length=window, trxl_pe_length=80)
-    live, stored = memory.initial(STEPS, LANES, torch.device("cpu")), memory.storage(STEPS, LANES, torch.device("cpu"))
-    live, stored.items = in_double(live), stored.items.double()
-    generator = torch.Generator().manual_seed(3)
+    state, generator = fresh(memory), torch.Generator().manual_seed(3)
     for _ in range(3):
         x = torch.randn(STEPS, LANES, WIDTH, dtype=torch.float64, generator=generator)
         done = torch.rand(STEPS, LANES, generator=generator) < 0.1
         done[:, 0] = False
         played = []
         with torch.no_grad():
-            live = memory.refresh(live, stored)
+            state = memory.begin_rollout(state)
             for t in range(STEPS):
-                y, live, item = memory.step(x[t], live)
-                memory.store(stored, t, item)
-                live = memory.reset(live, done[t])
+                y, state = memory.step(x[t], state)
+                state = memory.reset(state, done[t])
                 played.append(y)
         pieces = memory.cut(done)
-        unrolled = memory.unroll(x.flatten(0, 1)[pieces.steps()], pieces, stored)
-        torch.testing.assert_close(unrolled, torch.stack(played).flatten(0, 1)[pieces.steps()], rtol=0, atol=1e-10)
+        index = pieces.flat_index()
+        unrolled = memory.unroll(x.flatten(0, 1)[index], pieces, state)
+        torch.testing.assert_close(unrolled, torch.stack(played).flatten(0, 1)[index], rtol=0, atol=1e-10)
         with torch.no_grad():
             for parameter in memory.parameters():
-                parameter.mul_(0.9)  # the cache has to be made anew
-    assert live.steps[0] == 3 * STEPS
+                parameter.mul_(0.9)  # the cache has to be computed again
+    assert state.episode_step[0] == 3 * STEPS
 
 
 def test_window_edges():
@@ -152,7 +144,7 @@ def test_attention_weights_are_those_that_were_used(encoding):
     x, keys, values = (torch.randn(4, length, WIDTH, dtype=torch.float64) for length in (3, 6, 6))
     age = 3 + torch.arange(3)[:, None] - torch.arange(6)
     seen = visible(age, torch.tensor([0, 1, 2, 3])[:, None, None] + torch.arange(3)[:, None], 4)
-    weights = attention.weights(x, keys, age, seen)
+    weights = attention_weights(attention, x, keys, age, seen)
     assert weights[0, :, 0].eq(0).all(), "the first step of an episode looks at nothing"
     torch.testing.assert_close(weights.sum(-1)[1:], torch.ones(3, 2, 3, dtype=torch.float64))
     assert (weights > 0).equal(seen[:, None].expand_as(weights))
@@ -180,25 +172,31 @@ def test_attention_equals_the_library_s():
     wanted, weights = library(x, items, items, attn_mask=~seen, average_attn_weights=False)
     age, seen = torch.ones(3, 7, dtype=torch.int64), seen.expand(2, 3, 7)
     torch.testing.assert_close(attention(x, attention.key(items), attention.value(items), age, seen), wanted)
-    torch.testing.assert_close(attention.weights(x, attention.key(items), age, seen), weights)
+    torch.testing.assert_close(attention_weights(attention, x, attention.key(items), age, seen), weights)
 
 
 def test_attention_of_a_step():
     memory = make_memory(trxl_positional_encoding="relative")
-    live = memory.initial(STEPS, LANES, torch.device("cpu"))
-    live = in_double(live)
+    state = fresh(memory)
     for t in range(9):
         x = torch.randn(LANES, WIDTH, dtype=torch.float64)
-        weights = memory.attention(x, live)
+        weights = attention_of(memory, x, state)
         assert weights.shape == (LANES, 2, 2, min(max(t, 1), 5))
         torch.testing.assert_close(weights.sum(-1), torch.full((LANES, 2, 2), float(t > 0), dtype=torch.float64))
         with torch.no_grad():
-            _, live, _ = memory.step(x, live)
+            _, state = memory.step(x, state)
+
+
+def test_the_drawn_example():
+    """What the docstring of Memory.unroll draws."""
+    age = torch.arange(4)[:, None] - torch.tensor([-3, -2, -1, 0, 1, 2])
+    seen = visible(age, torch.tensor([5, 6, 0, 1])[:, None], 3).int().tolist()
+    assert seen == [[1, 1, 1, 0, 0, 0], [0, 1, 1, 1, 0, 0], [0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1]]
 
 
 @pytest.mark.parametrize("fill", [1e6, math.nan])
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_what_is_not_seen_changes_nothing(encoding, fill, shapes):
+def test_what_is_not_seen_changes_nothing(encoding, fill):
     memory = make_memory(trxl_positional_encoding=encoding)
     stored = make_timeline(memory)
     pieces = memory.cut(torch.zeros(STEPS, LANES, dtype=torch.bool))
@@ -213,52 +211,55 @@ def test_what_is_not_seen_changes_nothing(encoding, fill, shapes):
     clean = learn()
     stored.items[: memory.window, 0] = fill
     for lane in range(LANES):
-        ends = (stored.steps[1:, lane] == 0).nonzero()[:, 0]
+        ends = (stored.item_steps[1:, lane] == 0).nonzero()[:, 0]
         stored.items[ends[ends >= memory.window], lane] = fill  # an episode's last item is seen by none
     assert (stored.items != stored.items.clamp(-1e5, 1e5)).sum() > 50
     for got, want in zip(learn(), clean, strict=True):
         assert got.equal(want)
 
 
-def test_a_forgotten_episode_leaves_nothing_in_the_cache(shapes):
+def test_a_forgotten_episode_leaves_nothing_in_the_cache():
     memory = make_memory()
-    live = memory.initial(STEPS, 2, torch.device("cpu"))
-    live = in_double(live)
+    state = fresh(memory, 2)
     with torch.no_grad():
         for _ in range(4):
-            _, live, _ = memory.step(torch.full((2, WIDTH), math.nan).double(), live)
-        live = memory.reset(live, torch.tensor([True, True]))
+            _, state = memory.step(torch.full((2, WIDTH), math.nan).double(), state)
+        state = memory.reset(state, torch.tensor([True, True]))
         for _ in range(7):
-            y, live, _ = memory.step(torch.randn(2, WIDTH).double(), live)
+            y, state = memory.step(torch.randn(2, WIDTH).double(), state)
             assert y.isfinite().all()
 
 
-def test_taking_a_step_again_changes_nothing(shapes):
+def test_taking_a_step_again_changes_nothing():
+    """As is done to value an observation that is not acted on, the one after the rollout's last step included."""
     memory = make_memory()
-    live = memory.initial(STEPS, LANES, torch.device("cpu"))
-    live = in_double(live)
+    state, again = fresh(memory), fresh(memory)
     with torch.no_grad():
-        for _ in range(8):
+        for _ in range(STEPS):
             x, other = torch.randn(2, LANES, WIDTH).double()
-            first = memory.step(x, live)[0]
-            memory.step(other, live)
-            again, live, _ = memory.step(x, live)
-            assert first.equal(again)
+            memory.step(other, again)
+            (y, state), (y_again, again) = memory.step(x, state), memory.step(x, again)
+            assert y.equal(y_again)
+        memory.step(other, again)
+        for rows in ("items", "item_steps"):
+            assert getattr(state, rows)[:-1].equal(getattr(again, rows)[:-1])
+        state, again = memory.begin_rollout(state), memory.begin_rollout(again)
+        assert memory.step(x, state)[0].equal(memory.step(x, again)[0])
 
 
 def test_episodes_longer_than_a_learned_encoding():
     for encoding in ENCODINGS:
         memory = make_memory(trxl_positional_encoding=encoding, trxl_pe_length=6)
-        live = memory.initial(STEPS, 1, torch.device("cpu"))
-        live = in_double(live)._replace(steps=live.steps + 5)
+        state = fresh(memory, 1)
+        state = state._replace(episode_step=state.episode_step + 5)
         with torch.no_grad():
             for _ in range(2):  # the sixth step of six, and what follows it, which --bootstrap-truncated values
-                _, live, _ = memory.step(torch.randn(1, WIDTH).double(), live)
+                _, state = memory.step(torch.randn(1, WIDTH).double(), state)
             if encoding == "learned":
                 with pytest.raises(ValueError, match="--trxl-pe-length is 6, but an episode is longer"):
-                    memory.step(torch.randn(1, WIDTH).double(), live)
+                    memory.step(torch.randn(1, WIDTH).double(), state)
             else:
-                memory.step(torch.randn(1, WIDTH).double(), live)
+                memory.step(torch.randn(1, WIDTH).double(), state)
 
 
 def test_sinusoid():
