@@ -6,18 +6,19 @@ The agent gets one observation at a time and carries a hidden state from step to
 The rollout stores the hidden state that each step began with. For the update, the steps of each environment are cut
 into sequences at the ends of episodes (and every --seq-len steps), padded with zeros to the longest sequence, and
 unrolled from the stored hidden state of their first step: truncated back-propagation through time. The gradient
-reaches back to the first step of the sequence. The hidden state that a sequence starts from was computed with the
-weights of the rollout and is not recomputed.
+reaches back to the first step of the sequence. The hidden state that a sequence starts from was computed while acting,
+possibly with older weights, and is not recomputed.
 
-Source: chapter 5 of "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", called the
-thesis below. Numbers in brackets are its sections, or its equations as in (5.7); defaults are the "Final" column of its
-table 6.1.
+Source: "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", called the thesis below.
+§5.2 is its section, (5.7) its equation; defaults are the "Final" column of its table 6.1.
 
-How to read: sections 1 to 6 from top to bottom are the whole algorithm, and only section 4 knows which memory it is.
-Evaluation (7), run folders and files (8) and what only makes it faster (9) may be skipped.
+How to read: sections 1 to 6 from top to bottom are the algorithm. The memory is section 4; the other sections would be
+the same with another one, but for its flags. What evaluates (7), what runs a training (8: run folder, files, command
+line) and what only makes it faster (9) may be skipped.
 
 Shape letters: T steps of a rollout, N environments, A action branches, B samples of a minibatch, S sequences of a
-minibatch, L steps of the longest, D width of the memory, P hidden vectors per environment.
+minibatch, L steps of the longest, D width of the memory, P hidden vectors per environment, F features, G entries of the
+ground truth, V entries of a vector.
 """
 
 import argparse
@@ -49,38 +50,23 @@ from memory_gym_envs.making import final_numbers, final_observations, make_envs,
 
 
 # ---- 1 ARGS ----
-@dataclass(frozen=True)
-class Bounds:
-    """What a number on the command line may be: --help shows it, and `check_args` holds it."""
+class Bounds(NamedTuple):
+    """What a number on the command line may be: --help shows it, and `check_args` enforces it."""
 
-    low: float
-    high: float = math.inf
-    low_allowed: bool = True
-
-    def allow(self, value: float) -> bool:
-        """Tell whether the value lies within the bounds; infinities and NaN never do."""
-        above = self.low <= value if self.low_allowed else self.low < value
-        return above and value <= self.high and math.isfinite(value)
-
-    def __str__(self) -> str:
-        if math.isinf(self.low):
-            return "any finite number"
-        if math.isinf(self.high):
-            return f"{self.low} or more" if self.low_allowed else f"above {self.low}"
-        return f"{self.low} to {self.high}"
+    text: str
+    allow: Callable[[float], bool]
 
 
-def bounded(kind: type, *limits: Any) -> Any:
-    """Return the type of a flag with these bounds."""
-    bounds = Bounds(*limits)
-    return Annotated[kind, bounds, tyro.conf.arg(metavar=f"{kind.__name__.upper()} ({bounds})")]
+def bounded(kind: type, text: str, allow: Callable[[float], bool]) -> Any:
+    """Return the type of a flag with bounds."""
+    return Annotated[kind, Bounds(text, allow), tyro.conf.arg(metavar=f"{kind.__name__.upper()} ({text})")]
 
 
-PositiveInt = bounded(int, 1)
-NonNegativeInt = bounded(int, 0)
-PositiveFloat = bounded(float, 0, math.inf, False)
-NonNegativeFloat = bounded(float, 0)
-UnitInterval = bounded(float, 0, 1)
+PositiveInt = bounded(int, "1 or more", lambda x: x >= 1)
+NonNegativeInt = bounded(int, "0 or more", lambda x: x >= 0)
+PositiveFloat = bounded(float, "above 0", lambda x: 0 < x < math.inf)
+NonNegativeFloat = bounded(float, "0 or more", lambda x: 0 <= x < math.inf)
+UnitInterval = bounded(float, "0 to 1", lambda x: 0 <= x <= 1)
 
 
 @dataclass
@@ -90,7 +76,7 @@ class Args:
     exp_name: str = "ppo_gru"
     """name of the experiment, part of the run folder's name"""
     preset: Literal["thesis", "laptop"] = "thesis"
-    """a set of defaults, listed above; flags that are given win over it"""
+    """a set of defaults, see PRESETS; flags that are given win over it"""
     seed: NonNegativeInt = 1
     """seed of the weights, the actions and the environments: same seed, same curves (on the CPU to the last bit)"""
     torch_deterministic: bool = True
@@ -100,7 +86,7 @@ class Args:
     amp: bool = False
     """compute the networks in bfloat16, faster on processors that have it; losses stay in float32"""
     compile: bool = False
-    """compile convolutions and heads before training: takes a minute, and on a CPU a C++ compiler"""
+    """compile the convolutions and the heads before training: takes a minute, and on a CPU a C++ compiler"""
     track: bool = False
     """log to Weights and Biases too (needs the extra `track`)"""
     wandb_project_name: str = "memory-gym-baselines"
@@ -124,17 +110,17 @@ class Args:
     start_level: NonNegativeInt = 0
     """the first of these levels"""
     obs_type: Literal["pixels", "vector"] = "pixels"
-    """what a Memory Gym environment shows: pictures, or a vector of all that can be seen on them (other environments
-    have one kind of observation)"""
+    """what a Memory Gym environment shows: images, or a vector of all that can be seen on them (other environments have
+    one kind of observation)"""
     frame_stack: NonNegativeInt = 0
-    """observe the last so many pictures at once, in grayscale, or so many vectors (0: the present one, in colour)"""
+    """observe the last so many images at once, in grayscale, or so many vectors (0: the present one, in colour)"""
     step_encoding: bool = False
     """observe the number of the episode's step too, as a sinusoidal encoding of width 16"""
     observe_last_action: bool = False
     """observe the last action and reward too, as a one-hot vector and a number"""
     spotlight_perturbation: bool = False
-    """put a veil over the picture, with holes that move as the spotlights of Searing Spotlights do (7.2)"""
-    vector_frequencies: bounded(int, 0, 16) = 0
+    """put a veil over the image, with holes that move as the spotlights of Searing Spotlights do (thesis §7.2)"""
+    vector_frequencies: bounded(int, "0 to 16", lambda x: 0 <= x <= 16) = 0
     """number of frequencies of the Fourier features that the network gets of a vector with entries from 0 to 1"""
 
     total_timesteps: PositiveInt = 163_840_000
@@ -146,7 +132,7 @@ class Args:
     num_minibatches: PositiveInt = 8
     """minibatches of an epoch"""
     update_epochs: PositiveInt = 3
-    """number of times that each rollout is learned from"""
+    """passes over each rollout"""
     gamma: UnitInterval = 0.995
     """discount factor"""
     gae_lambda: UnitInterval = 0.95
@@ -156,7 +142,7 @@ class Args:
     norm_adv: bool = False
     """normalize the advantages of each minibatch"""
     clip_coef: PositiveFloat = 0.1
-    """how far the probability ratio, and the value, may move from the rollout's"""
+    """how far the probability ratio may move from 1, and the value from the rollout's"""
     clip_vloss: bool = True
     """clip the value loss too"""
     vf_coef: NonNegativeFloat = 0.5
@@ -176,20 +162,20 @@ class Args:
     anneal_steps: NonNegativeInt = 163_840_000
     """steps over which both decay linearly (0: both keep their initial values)"""
     reconstruction_coef: NonNegativeFloat = 0.0
-    """weight of the loss of reconstructing the picture from the memory's output (0: off; the thesis has 0.1)"""
+    """weight of the loss of reconstructing the image from the memory's output (0: off; the thesis has 0.1)"""
     ground_truth_coef: NonNegativeFloat = 0.0
     """weight of the loss of estimating the environment's ground truth (0: off; the thesis has 0.1)"""
     ground_truth_detach: bool = False
     """estimate it without teaching the agent: a probe of what its memory holds"""
     head_size: PositiveInt = 512
-    """width of the layer behind the memory, and of the heads' own layers"""
+    """width of the layer after the memory, and of the heads' own layers"""
 
     eval_interval: NonNegativeInt = 0
     """iterations from one evaluation to the next, and one at the end, on levels that are not trained on (0: none)"""
     eval_levels: PositiveInt = 50
-    """levels of an evaluation: those that follow start_level + num_levels - 1"""
+    """levels of an evaluation, from start_level + num_levels on"""
     eval_repeats: PositiveInt = 3
-    """how often an evaluation plays each level"""
+    """times that an evaluation plays each level"""
     eval_max_steps: PositiveInt = 10_000
     """steps after which an evaluation cuts an endless episode short"""
 
@@ -222,21 +208,13 @@ PRESETS = {
         "total_timesteps": 1_000_000,
     },
 }
-# What decides the shapes of the weights, and so which runs a model file can be loaded into.
-SHAPING = (
-    "env_id",
-    "obs_type",
-    "frame_stack",
-    "step_encoding",
-    "observe_last_action",
-    "vector_frequencies",
-    "head_size",
-)
-SHAPING += ("memory", "hidden_size", "num_layers")
+# What shapes the network; an error message names these if weights do not fit.
+NETWORK_FLAGS = ("env_id", "obs_type", "frame_stack", "step_encoding", "observe_last_action", "vector_frequencies")
+NETWORK_FLAGS = (*NETWORK_FLAGS, "head_size", "memory", "hidden_size", "num_layers")
 
 
-def check_memory_args(args: Args) -> int:
-    """Return the steps that the longest piece of a rollout may have; raise ValueError for what cannot work."""
+def longest_piece(args: Args) -> int:
+    """Return how many steps a piece of a rollout, see `Pieces`, may have."""
     return 1 if args.memory == "none" else min(args.seq_len or args.num_steps, args.num_steps)
 
 
@@ -275,14 +253,17 @@ def gae(
 
 
 def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tensor:
-    """Return the clipped surrogate loss (2.41) of log_ratio (B, A), averaged over branches (5.4) and samples."""
+    """Return the clipped surrogate loss (2.41) of log_ratio (B, A): its mean over branches (5.4) and samples."""
     ratio, advantages = log_ratio.exp(), advantages[:, None]
     clipped = ratio.clamp(1 - clip_coef, 1 + clip_coef)
     return -torch.minimum(ratio * advantages, clipped * advantages).mean()
 
 
 def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: float | None) -> Tensor:
-    """Return the mean squared error of values (B,), clipped around old_values (2.43) unless clip_coef is None."""
+    """Return the mean squared error of values (B,), clipped around old_values (2.43) unless clip_coef is None.
+
+    There is no factor 1/2, which CleanRL has.
+    """
     loss = (values - returns).square()
     if clip_coef is not None:
         clipped = old_values + (values - old_values).clamp(-clip_coef, clip_coef)
@@ -291,19 +272,19 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: f
 
 
 def reconstruction_loss(logits: Tensor, pixels: Tensor) -> Tensor:
-    """Return the mean binary cross-entropy (5.5) of reconstructed pictures, as logits, and pixels (B, H, W, C)."""
+    """Return the mean binary cross-entropy (5.5) of logits and pixels, (B, height, width, channels) each."""
     return F.binary_cross_entropy_with_logits(logits, pixels / 255 if pixels.dtype == torch.uint8 else pixels)
 
 
 @torch.no_grad()
 def policy_metrics(log_ratio: Tensor, clip_coef: float) -> dict[str, Tensor]:
     """Return what to log of log_ratio (B, A): how far the policy has moved from the rollout's."""
-    off, joint = log_ratio.exp() - 1, log_ratio.sum(-1)  # the branches are independent: log-ratios add up
+    deviation, joint = log_ratio.exp() - 1, log_ratio.sum(-1)  # the branches are independent: log-ratios add up
     return {
         "old_approx_kl": -joint.mean(),
         "approx_kl": (joint.exp() - 1 - joint).mean(),  # http://joschu.net/blog/kl-approx.html
-        "clipfrac": (off.abs() > clip_coef).float().mean(),
-        "ratio_error": off.abs().max(),
+        "clipfrac": (deviation.abs() > clip_coef).float().mean(),
+        "ratio_error": deviation.abs().max(),
     }
 
 
@@ -315,16 +296,16 @@ def explained_variance(values: Tensor, returns: Tensor) -> float:
 
 @dataclass
 class Pieces:
-    """Parts of a rollout that minibatches are made of: runs of consecutive steps of one environment each.
+    """Runs of consecutive steps of one environment each, which minibatches are made of.
 
-    A rollout's tensors are (T, N, ...); flattened, step t of environment n has the index t * N + n. A memory decides
-    where to cut. With T = 5, N = 2 and a recurrent memory, which cuts where an episode ends, here environment 0's
-    after t = 2:
+    A memory decides where a rollout is cut: a recurrent one into sequences, at the ends of episodes; a transformer into
+    segments of the same length. A rollout's tensors are (T, N, ...); flattened, step t of environment n has the index
+    t * N + n. Two environments, five steps, and an episode of environment 0 that ends after t = 2, cut into sequences:
 
-        flat indices   t = 0  1  2  3  4        pieces       first   length
-        environment 0      0  2  4 |6  8        0  2  4        0       3
-        environment 1      1  3  5  7  9        6  8           6       2
-                                                1  3  5  7  9  1       5
+        flat indices   t = 0  1  2  3  4        pieces         first   length
+        environment 0      0  2  4 |6  8        0  2  4          0       3
+        environment 1      1  3  5  7  9        6  8             6       2
+                                                1  3  5  7  9    1       5
 
     flat_index() lists the steps of all pieces, (B,): 0 2 4 6 8 1 3 5 7 9. What belongs to them, x (B, D), is padded
     for a network that runs over time, pad(x) (S, L, D), and unpad takes the padding away again:
@@ -339,24 +320,25 @@ class Pieces:
     num_envs: int  # N
 
     @classmethod
-    def cut(cls, begins: Tensor) -> "Pieces":
-        """Cut the rollout of all environments before every step where begins (T, N) is true; step 0 must be."""
+    def beginning(cls, begins: Tensor) -> "Pieces":
+        """Make pieces that begin at every step where begins (T, N) is true, as it is at t = 0."""
         num_steps, num_envs = begins.shape
         cuts = begins.T.flatten().nonzero()[:, 0]  # environment after environment: n * T + t
         length = torch.diff(cuts, append=torch.tensor([num_steps * num_envs]))
-        return cls(cuts % num_steps * num_envs + cuts // num_steps, length, num_envs)
+        n, t = cuts // num_steps, cuts % num_steps
+        return cls(t * num_envs + n, length, num_envs)
 
-    def positions(self) -> Tensor:
-        """Number the columns (L,) of a padded batch."""
+    def columns(self) -> Tensor:
+        """Return the column indices 0 .. L - 1 of a padded batch."""
         return torch.arange(int(self.length.max()))
 
-    def is_real(self) -> Tensor:
-        """Tell which entries (S, L) of a padded batch are steps, and which are padding."""
-        return self.positions() < self.length[:, None]
+    def is_step(self) -> Tensor:
+        """Return the mask (S, L) of a padded batch: true at steps, false at padding."""
+        return self.columns() < self.length[:, None]
 
     def flat_index(self) -> Tensor:
         """Return the flat indices (B,) of all steps, piece after piece."""
-        return (self.first[:, None] + self.positions() * self.num_envs)[self.is_real()]
+        return (self.first[:, None] + self.columns() * self.num_envs)[self.is_step()]
 
     def pad(self, x: Tensor) -> Tensor:
         """Pad what belongs to the steps, (B, D), with zeros to the longest piece: (S, L, D)."""
@@ -364,11 +346,11 @@ class Pieces:
 
     def unpad(self, y: Tensor) -> Tensor:
         """Take the padding away: (S, L, ...) to (B, ...)."""
-        real = self.is_real().flatten().nonzero()[:, 0]
-        return y.flatten(0, 1).index_select(0, real.to(y.device))
+        steps = self.is_step().flatten().nonzero()[:, 0]  # found on the CPU: a mask would make a GPU wait
+        return y.flatten(0, 1).index_select(0, steps.to(y.device))
 
     def minibatches(self, count: int) -> Iterator["Pieces"]:
-        """Shuffle the pieces and deal them, whole, into count minibatches of nearly the same number of steps."""
+        """Shuffle the pieces, and distribute them, whole, over count minibatches of about the same number of steps."""
         order = torch.randperm(len(self.first))
         first, length = self.first[order], self.length[order]
         minibatch = (length.cumsum(0) - length) * count // length.sum()  # (S,) the one that a piece goes to
@@ -381,12 +363,15 @@ class Pieces:
 def layer_init(layer: nn.Module, gain: float = math.sqrt(2)) -> nn.Module:
     """Initialize a layer's weights orthogonally and its biases with zero; return it."""
     for name, parameter in layer.named_parameters():
-        nn.init.zeros_(parameter) if "bias" in name else nn.init.orthogonal_(parameter, gain)
+        if "bias" in name:
+            nn.init.zeros_(parameter)
+        else:
+            nn.init.orthogonal_(parameter, gain)
     return layer
 
 
 class AtariCNN(nn.Sequential):
-    """The convolutions of Mnih et al. (2015), table 6.2."""
+    """The convolutions of Mnih et al. (2015), table 6.2. `speed_up` in section 9 runs them in chunks on a CPU."""
 
     def __init__(self, channels: int):
         super().__init__(
@@ -409,15 +394,14 @@ class AtariCNN(nn.Sequential):
 def fourier_features(x: Tensor, frequencies: int) -> Tensor:
     """Append sines and cosines of x (B, V) at pi, 2 pi, 4 pi ...: (B, V (1 + 2 frequencies)).
 
-    What differs little in x differs much in these, so that a network learns sooner to tell it apart (Tancik et al.,
-    2020).
+    They magnify small differences, so that a network learns sooner to tell values apart (Tancik et al., 2020).
     """
     angles = x[..., None] * (math.pi * 2 ** torch.arange(frequencies, device=x.device))  # (B, V, frequencies)
     return torch.cat([x, angles.sin().flatten(1), angles.cos().flatten(1)], -1)
 
 
 class Encoder(nn.Module):
-    """Encodes each part of an observation, concatenates the features and embeds them in the memory's width (5.1).
+    """Encodes each part of an observation, concatenates the features and embeds them in the memory's width (§5.1).
 
     Raises ValueError for frequencies without a vector to take them of.
     """
@@ -425,11 +409,11 @@ class Encoder(nn.Module):
     def __init__(self, spaces: dict[str, gym.spaces.Box], width: int, frequencies: int):
         super().__init__()
         self.frequencies = frequencies
-        self.pictures = [name for name, space in spaces.items() if len(space.shape) == 3]
+        self.images = [name for name, space in spaces.items() if len(space.shape) == 3]
         self.vectors = [name for name, space in spaces.items() if len(space.shape) == 1]
-        self.cnns = nn.ModuleList(AtariCNN(spaces[name].shape[2]) for name in self.pictures)
+        self.cnns = nn.ModuleList(AtariCNN(spaces[name].shape[2]) for name in self.images)
         with torch.no_grad():
-            blank = [torch.zeros(1, *spaces[name].shape) for name in self.pictures]
+            blank = [torch.zeros(1, *spaces[name].shape) for name in self.images]
             features = sum(cnn(x).shape[1] for cnn, x in zip(self.cnns, blank, strict=True))
         if self.vectors:
             entries = sum(spaces[name].shape[0] for name in self.vectors)
@@ -441,7 +425,7 @@ class Encoder(nn.Module):
 
     def forward(self, obs: dict[str, Tensor]) -> Tensor:
         """Encode observations, each part (B, ...), to (B, D)."""
-        features = [cnn(obs[name]) for cnn, name in zip(self.cnns, self.pictures, strict=True)]
+        features = [cnn(obs[name]) for cnn, name in zip(self.cnns, self.images, strict=True)]
         if self.vectors:
             vector = torch.cat([obs[name] for name in self.vectors], -1)
             features.append(F.relu(self.mlp(fourier_features(vector, self.frequencies))))
@@ -451,21 +435,21 @@ class Encoder(nn.Module):
 class Heads(nn.Module):
     """The layer after the memory, the multi-discrete policy and the state value (table 6.2)."""
 
-    def __init__(self, width: int, branches: list[int], size: int):
+    def __init__(self, width: int, nvec: list[int], size: int):
         super().__init__()
-        self.branches = branches  # number of actions of each
+        self.nvec = nvec  # number of actions of each branch, as Gymnasium calls it
         self.trunk = layer_init(nn.Linear(width, size))
-        self.policy = head(size, sum(branches), 0.1)
+        self.policy = head(size, sum(nvec), 0.1)
         self.value = head(size, 1, 1.0)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Map what the memory says, (B, D), to the logits of all branches, values (B,) and features (B, F)."""
+        """Map the memory's output (B, D) to the logits of all branches, values (B,) and features (B, F)."""
         features = F.relu(self.trunk(x))
         return self.policy(features).float(), self.value(features)[:, 0].float(), features
 
     def distributions(self, logits: Tensor) -> list[Categorical]:
-        """Make the distribution of each branch's action, of the logits of all branches."""
-        return [Categorical(logits=part, validate_args=False) for part in logits.split(self.branches, -1)]
+        """Make the distribution of each branch's action from the logits of all branches."""
+        return [Categorical(logits=part, validate_args=False) for part in logits.split(self.nvec, -1)]
 
 
 def head(size: int, outputs: int, gain: float) -> nn.Sequential:
@@ -476,17 +460,17 @@ def head(size: int, outputs: int, gain: float) -> nn.Sequential:
 
 
 class Decoder(nn.Sequential):
-    """The transposed Atari CNN, which reconstructs the observed picture (5.1.2, table 6.2).
+    """The transposed Atari CNN, which reconstructs the observed image (§5.1.2, table 6.2).
 
-    Raises ValueError unless the observation has one picture.
+    Raises ValueError unless the observation has one image.
     """
 
     def __init__(self, features: int, spaces: dict[str, gym.spaces.Box]):
-        pictures = [space.shape for space in spaces.values() if len(space.shape) == 3]
-        if len(pictures) != 1:
-            raise ValueError(f"--reconstruction-coef needs an observation with one picture, not {len(pictures)}; use 0")
-        height, width, channels = pictures[0]
-        sizes = [(height, width)]  # of the encoder's pictures, from the observation on
+        images = [space.shape for space in spaces.values() if len(space.shape) == 3]
+        if len(images) != 1:
+            raise ValueError(f"--reconstruction-coef needs an observation with one image, not {len(images)}; use 0")
+        height, width, channels = images[0]
+        sizes = [(height, width)]  # of the image and of each convolution's output
         for kernel, stride in ((8, 4), (4, 2), (3, 1)):
             sizes.append(tuple((size - kernel) // stride + 1 for size in sizes[-1]))
         # Pixels at the right and lower edge that the encoder's first two strides do not reach.
@@ -503,34 +487,37 @@ class Decoder(nn.Sequential):
         )
 
     def forward(self, features: Tensor) -> Tensor:
-        """Map features (B, F) to the logits of pictures (B, height, width, channels)."""
+        """Map features (B, F) to the logits of images (B, height, width, channels)."""
         return super().forward(features).permute(0, 2, 3, 1)
 
 
 # ---- 4 MEMORY ----
+# What the other sections use of a memory, whichever it is: Memory(args), an nn.Module of width D, and its MemoryState.
+# While acting: initial_state, begin_rollout, step (which also stores what the update needs), reset where an episode
+# ended. For the update: cut the rollout into pieces, and unroll pieces. And logs, numbers for TensorBoard.
 class MemoryState(NamedTuple):
-    """What N environments remember, and what a rollout of T steps stores of it."""
+    """What N environments remember. `t` and `hidden` are replaced step by step, `stored` is written in place."""
 
     t: int  # the step of the rollout that comes next
-    hidden: Tensor  # (N, P, D) what each environment remembers before that step
-    stored: Tensor  # (T + 1, N, P, D) what it remembered before each step; the last is for valuing what follows
+    hidden: Tensor  # (N, P, D) the hidden state before that step
+    stored: Tensor  # (T + 1, N, P, D) the hidden state before each step; row T is that of the bootstrap value
 
 
 class Memory(nn.Module):
-    """A stack of GRU or LSTM layers, or nothing (5.2).
+    """A stack of GRU or LSTM layers, or nothing (§5.2).
 
-    An environment's memory is P hidden vectors of width D: one a layer for the GRU, two (hidden, then cell state) for
-    the LSTM, none without memory.
+    The hidden state of an environment is P vectors of width D: one a layer for the GRU, two (hidden, then cell state)
+    for the LSTM, none without memory.
     """
 
     def __init__(self, args: Args):
         super().__init__()
         self.kind, self.seq_len, self.width = args.memory, args.seq_len, args.hidden_size
-        self.packed = args.memory == "gru"  # the update may run over packed sequences, see `unroll`
+        self.packed = args.memory == "gru"  # the update needs no padding on a CPU, see `unroll`
         self.hidden_vectors = args.num_layers * {"gru": 1, "lstm": 2, "none": 0}[args.memory]
         if args.memory != "none":
             rnn = nn.GRU if args.memory == "gru" else nn.LSTM
-            # The outputs are activated already: another ReLU behind them would throw half of them away (5.2.4).
+            # The outputs are activated already: another ReLU behind them would throw half of them away (§5.2.4).
             self.rnn = layer_init(rnn(self.width, self.width, args.num_layers, batch_first=True), 1.0)
 
     def initial_state(self, num_envs: int, num_steps: int, device: torch.device) -> MemoryState:
@@ -543,10 +530,9 @@ class Memory(nn.Module):
         return state._replace(t=0)
 
     def step(self, x: Tensor, state: MemoryState) -> tuple[Tensor, MemoryState]:
-        """Take one step of all environments: x (N, D) to (N, D), and the memory after it.
+        """Take one step of all environments: x (N, D) to (N, D), and the state after it. Stores the state before it.
 
-        Stores what the update needs of this step. The given state can be used again: until begin_rollout, taking the
-        same step once more stores it once more in the same place.
+        Who only wants a value keeps the given state and takes the step again: that overwrites row t of what is stored.
         """
         state.stored[state.t] = state.hidden
         if self.kind == "none":
@@ -564,13 +550,13 @@ class Memory(nn.Module):
         """Cut a rollout, whose episodes end where done (T, N) is true, into sequences."""
         begins = torch.ones_like(done)
         if self.kind == "none":
-            return Pieces.cut(begins)  # every step by itself
+            return Pieces.beginning(begins)  # every step by itself
         begins[1:] = done[:-1]
         if self.seq_len:
             t = torch.arange(len(done))[:, None]
             began = torch.where(begins, t, 0).cummax(0).values  # (T, N) the step that the episode began at
             begins = (t - began) % self.seq_len == 0
-        return Pieces.cut(begins)
+        return Pieces.beginning(begins)
 
     def unroll(self, x: Tensor, pieces: Pieces, state: MemoryState) -> Tensor:
         """Run whole sequences: x (B, D) to (B, D), each from the stored hidden state of its first step."""
@@ -593,56 +579,55 @@ class Memory(nn.Module):
         return y, hidden.transpose(0, 1)
 
     def logs(self, state: MemoryState) -> dict[str, float]:
-        """Return numbers of the last rollout to log: none."""
+        """Return what to log of the last rollout; nothing of a recurrent memory."""
         return {}
 
 
 # ---- 5 AGENT ----
 class Agent(nn.Module):
-    """Encoder, memory and heads. Acts step by step, and evaluates whole pieces of what it did.
+    """Encoder, memory and heads: acts step by step, and evaluates whole pieces of what it did.
 
-    ground_truth_size is the number of entries of the environment's ground truth. Raises ValueError for an observation
-    that does not suit the arguments.
+    nvec: number of actions of each branch. ground_truth_size: entries of the environment's ground truth. Raises
+    ValueError for an observation that does not suit the arguments.
     """
 
-    def __init__(self, space: gym.spaces.Dict, branches: list[int], args: Args, ground_truth_size: int = 0):
+    def __init__(self, space: gym.spaces.Dict, nvec: list[int], args: Args, ground_truth_size: int = 0):
         super().__init__()
         self.memory = Memory(args)
         self.encoder = Encoder(space.spaces, self.memory.width, args.vector_frequencies)
-        self.heads = Heads(self.memory.width, branches, args.head_size)
-        with torch.random.fork_rng([]):  # the random numbers that follow are the same with and without these
+        self.heads = Heads(self.memory.width, nvec, args.head_size)
+        with torch.random.fork_rng([]):  # with and without these, the random numbers that follow are the same
             self.decoder = Decoder(args.head_size, space.spaces) if args.reconstruction_coef else None
             self.estimator = head(args.head_size, ground_truth_size, 1.0) if args.ground_truth_coef else None
 
-    def act(self, obs: dict[str, Tensor], memory: MemoryState) -> tuple[Tensor, Tensor, Tensor, MemoryState]:
+    def act(self, obs: dict[str, Tensor], state: MemoryState) -> tuple[Tensor, Tensor, Tensor, MemoryState]:
         """Take one step of all environments.
 
-        Returns actions (N, A), their log-probabilities (N, A), values (N,) and the memory after the step.
+        Returns actions (N, A), their log-probabilities (N, A), values (N,) and the memory's state after the step.
         """
-        x, memory = self.memory.step(self.encoder(obs), memory)
+        x, state = self.memory.step(self.encoder(obs), state)
         logits, values, _ = self.heads(x)
         policy = self.heads.distributions(logits)
         actions = torch.stack([branch.sample() for branch in policy], -1)
-        return actions, log_probs_of(policy, actions), values, memory
+        return actions, log_probs_of(policy, actions), values, state
 
-    def get_value(self, obs: dict[str, Tensor], memory: MemoryState) -> Tensor:
+    def get_value(self, obs: dict[str, Tensor], state: MemoryState) -> Tensor:
         """Return the values (N,) of observations that are not acted on."""
-        x, _ = self.memory.step(self.encoder(obs), memory)
+        x, _ = self.memory.step(self.encoder(obs), state)
         return self.heads(x)[1]
 
     def evaluate_actions(
-        self, obs: dict[str, Tensor], which: Tensor, actions: Tensor, pieces: Pieces, memory: MemoryState
+        self, observations: "UniqueObservations", actions: Tensor, pieces: Pieces, state: MemoryState
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Recompute, with gradient, what `act` computed at the steps of the pieces.
 
-        obs holds every different observation once, and which (B,) says which of them each step had. Returns the
-        log-probabilities (B, A) of the actions (B, A), entropies (B,), values (B,) and features (B, F).
+        Returns the log-probabilities (B, A) of the actions (B, A), entropies (B,), values (B,) and features (B, F).
         """
-        x = self.encoder(obs).index_select(0, which)  # (B, D)
-        logits, values, features = self.heads(self.memory.unroll(x, pieces, memory))
+        x = observations.encode(self.encoder, pieces.flat_index())  # (B, D); section 9: on a CPU, equal ones once
+        logits, values, features = self.heads(self.memory.unroll(x, pieces, state))
         policy = self.heads.distributions(logits)
         log_probs = log_probs_of(policy, actions)
-        entropy = torch.stack([branch.entropy() for branch in policy], -1).sum(-1)
+        entropy = torch.stack([branch.entropy() for branch in policy], -1).sum(-1)  # of independent branches: the sum
         return log_probs, entropy, values, features
 
 
@@ -652,13 +637,13 @@ def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
 
 
 class MemoryLimit(ValueError):
-    """A memory cannot hold what it is given; says which flag helps. Raised by `Memory.step`."""
+    """An episode is longer than the memory allows; says which flag helps. `Memory.step` may raise it."""
 
 
 # ---- 6 TRAINING ----
 @dataclass
 class Rollout:
-    """T steps of N environments to learn from, and what the next rollout goes on with; reused by every iteration."""
+    """T steps of N environments to learn from, and what the next rollout goes on with; overwritten by each one."""
 
     obs: dict[str, Tensor]  # each (T, N, ...): uint8 pixels stay uint8
     actions: Tensor  # (T, N, A)
@@ -669,11 +654,11 @@ class Rollout:
     truncated: Tensor  # (T, N) the step ended its episode by a time limit
     truncation_values: Tensor  # (T, N) value of the final observation, where bootstrapped
     ground_truth: Tensor | None  # (T, N, G), if it is estimated
-    advantages: Tensor  # (T, N)
-    returns: Tensor  # (T, N)
     next_obs: dict[str, np.ndarray]  # each (N, ...)
     next_ground_truth: np.ndarray | None  # (N, G)
-    memory: MemoryState  # of the steps, and of what comes next
+    memory_state: MemoryState  # of these steps, and before the next one
+    advantages: Tensor | None = None  # (T, N)
+    returns: Tensor | None = None  # (T, N)
 
     @classmethod
     def allocate(cls, num_steps: int, obs: dict[str, np.ndarray], truth: np.ndarray | None, agent: Agent) -> "Rollout":
@@ -683,7 +668,7 @@ class Rollout:
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(num_steps, num_envs, *shape, dtype=dtype, device=device)
 
-        branches = len(agent.heads.branches)
+        branches = len(agent.heads.nvec)
         return cls(
             obs={name: zeros(*part.shape[1:], dtype=part.dtype) for name, part in as_tensors(obs, device).items()},
             actions=zeros(branches, dtype=torch.int64),
@@ -694,11 +679,9 @@ class Rollout:
             truncated=zeros(dtype=torch.bool),
             truncation_values=zeros(),
             ground_truth=None if truth is None else zeros(truth.shape[1]),
-            advantages=zeros(),
-            returns=zeros(),
             next_obs=obs,
             next_ground_truth=truth,
-            memory=agent.memory.initial_state(num_envs, num_steps, device),
+            memory_state=agent.memory.initial_state(num_envs, num_steps, device),
         )
 
 
@@ -716,22 +699,23 @@ def as_tensors(obs: dict[str, np.ndarray], device: torch.device) -> dict[str, Te
 def collect(
     agent: Agent, envs: gym.vector.VectorEnv, rollout: Rollout, args: Args
 ) -> tuple[Tensor, dict[str, list[float]]]:
-    """Act for T steps in all environments; return the value (N,) of what follows, and numbers of the ended episodes.
+    """Act for T steps in all environments; return the value (N,) of what follows, and metrics of the ended episodes.
 
-    The numbers are lists by name: charts/episodic_return, charts/episodic_length, and episode/* for every number in
-    the environment's final info.
+    The environments are those of `memory_gym_envs.making`: an observation is a dict of images and vectors, and an ended
+    episode is reset in the same step, so that next_obs begins the next one. Metrics are lists by name:
+    charts/episodic_return, charts/episodic_length, and episode/* for every number in the environment's final info.
     """
     device, episodes = rollout.values.device, defaultdict(list)
     rollout.truncation_values.zero_()
     with autocast(args, device):
-        memory = agent.memory.begin_rollout(rollout.memory)
+        state = agent.memory.begin_rollout(rollout.memory_state)
         for t in range(args.num_steps):
             for name, part in rollout.next_obs.items():
                 rollout.obs[name][t] = torch.from_numpy(part)  # to the device, dtype kept
             if rollout.ground_truth is not None:
                 rollout.ground_truth[t] = torch.as_tensor(rollout.next_ground_truth)
             obs = {name: part[t] for name, part in rollout.obs.items()}
-            actions, rollout.log_probs[t], rollout.values[t], memory = agent.act(obs, memory)
+            actions, rollout.log_probs[t], rollout.values[t], state = agent.act(obs, state)
             rollout.actions[t] = actions
 
             next_obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
@@ -740,18 +724,18 @@ def collect(
             rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
             if args.bootstrap_truncated and truncated.any():
                 final = as_tensors(final_observations(next_obs, infos, truncated), device)
-                value = agent.get_value(final, memory)  # with the memory of the episode that ended
+                value = agent.get_value(final, state)  # with the memory of the episode that ended
                 rollout.truncation_values[t] = value * rollout.truncated[t]
-            memory = agent.memory.reset(memory, torch.as_tensor(done))
+            state = agent.memory.reset(state, torch.as_tensor(done))
             rollout.next_obs, rollout.next_ground_truth = next_obs, infos.get("ground_truth")
             if done.any():
                 append_episodes(episodes, infos, done)
-        rollout.memory = memory
-        return agent.get_value(as_tensors(rollout.next_obs, device), memory), episodes
+        rollout.memory_state = state
+        return agent.get_value(as_tensors(rollout.next_obs, device), state), episodes
 
 
 def append_episodes(episodes: dict[str, list[float]], infos: dict, done: np.ndarray) -> None:
-    """Append the numbers of the episodes that ended, where done (N,), to the lists."""
+    """Append the metrics of the episodes that ended, where done (N,) is true, to the lists."""
     episodes["charts/episodic_return"] += infos["episode"]["r"][done].tolist()
     episodes["charts/episodic_length"] += infos["episode"]["l"][done].tolist()
     for name, _, values in final_numbers(infos, done):
@@ -759,27 +743,24 @@ def append_episodes(episodes: dict[str, list[float]], infos: dict, done: np.ndar
 
 
 def ppo_loss(
-    agent: Agent, rollout: Rollout, observations: "UniqueObservations", pieces: Pieces, ent_coef: float, args: Args
+    agent: Agent, rollout: Rollout, observations: "UniqueObservations", minibatch: Pieces, ent_coef: float, args: Args
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the total loss (5.7) of the pieces' steps, and the numbers to log."""
-    index = pieces.flat_index().to(rollout.values.device)  # (B,)
+    """Return the total loss (5.7) of a minibatch, and what to log of it."""
+    index = minibatch.flat_index().to(rollout.values.device)  # (B,)
 
-    def mb(stored: Tensor) -> Tensor:
+    def gather(stored: Tensor) -> Tensor:
         return stored.flatten(0, 1).index_select(0, index)  # (T, N, ...) to (B, ...)
 
-    obs, which = observations.take(index)
     with autocast(args, index.device):
         log_probs, entropy, values, features = agent.evaluate_actions(
-            obs, which, mb(rollout.actions), pieces, rollout.memory
+            observations, gather(rollout.actions), minibatch, rollout.memory_state
         )
-        pictures = agent.decoder(features).float() if agent.decoder is not None else None
-    log_ratio = log_probs - mb(rollout.log_probs)  # (B, A)
-    advantages = mb(rollout.advantages)
+    log_ratio, entropy = log_probs - gather(rollout.log_probs), entropy.mean()  # (B, A), ()
+    advantages, old_values, returns = gather(rollout.advantages), gather(rollout.values), gather(rollout.returns)
     if args.norm_adv:
         advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
     pg_loss = policy_loss(log_ratio, advantages, args.clip_coef)
-    v_loss = value_loss(values, mb(rollout.values), mb(rollout.returns), args.clip_coef if args.clip_vloss else None)
-    entropy = entropy.mean()
+    v_loss = value_loss(values, old_values, returns, args.clip_coef if args.clip_vloss else None)
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
     logs = {
         "policy_loss": pg_loss,
@@ -787,48 +768,61 @@ def ppo_loss(
         "entropy": entropy,
         **policy_metrics(log_ratio, args.clip_coef),
     }
+    for name, auxiliary in auxiliary_losses(agent, features, rollout, gather, args).items():
+        loss = loss + getattr(args, f"{name}_coef") * auxiliary
+        logs[f"{name}_loss"] = auxiliary
+    logs["loss"] = loss
+    return loss, {name: value.detach() for name, value in logs.items()}
+
+
+def auxiliary_losses(
+    agent: Agent, features: Tensor, rollout: Rollout, gather: Callable[[Tensor], Tensor], args: Args
+) -> dict[str, Tensor]:
+    """Return the losses (5.5) and (5.6) of those auxiliary heads that the agent has; features (B, F)."""
+    losses = {}
     if agent.decoder is not None:
-        logs["reconstruction_loss"] = reconstruction_loss(pictures, mb(rollout.obs[agent.encoder.pictures[0]]))
-        loss = loss + args.reconstruction_coef * logs["reconstruction_loss"]
+        with autocast(args, features.device):
+            logits = agent.decoder(features)  # (B, height, width, channels)
+        losses["reconstruction"] = reconstruction_loss(logits.float(), gather(rollout.obs[agent.encoder.images[0]]))
     if agent.estimator is not None:
-        estimate = agent.estimator((features.detach() if args.ground_truth_detach else features).float())
-        logs["ground_truth_loss"] = F.mse_loss(estimate, mb(rollout.ground_truth))  # (5.6)
-        loss = loss + args.ground_truth_coef * logs["ground_truth_loss"]
-    return loss, {name: value.detach() for name, value in logs.items()} | {"loss": loss.detach()}
+        estimate = agent.estimator((features.detach() if args.ground_truth_detach else features).float())  # (B, G)
+        losses["ground_truth"] = F.mse_loss(estimate, gather(rollout.ground_truth))
+    return losses
 
 
 def update(
     agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, ent_coef: float, args: Args
 ) -> dict[str, float]:
     """Learn from the rollout for some epochs; return what to log, averaged over the minibatches."""
-    observations = UniqueObservations(rollout.obs, agent)  # section 9: on a CPU, equal pictures are encoded once
+    observations = UniqueObservations(rollout.obs, agent)
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
+    # A detached estimator is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
     probe = [*agent.estimator.parameters()] if args.ground_truth_detach and agent.estimator is not None else []
-    taught = [parameter for parameter in agent.parameters() if parameter not in set(probe)]
+    parameters = [parameter for parameter in agent.parameters() if not any(parameter is each for each in probe)]
     logs = []
     for _ in range(args.update_epochs):
         for minibatch in pieces.minibatches(args.num_minibatches):
             loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
             optimizer.zero_grad()
             loss.backward()
-            log["grad_norm"] = nn.utils.clip_grad_norm_(taught, args.max_grad_norm)
-            nn.utils.clip_grad_norm_(probe, args.max_grad_norm)  # apart, so that it takes no share of the agent's norm
+            log["grad_norm"] = nn.utils.clip_grad_norm_(parameters, args.max_grad_norm)
+            nn.utils.clip_grad_norm_(probe, args.max_grad_norm)
             optimizer.step()
             logs.append(log)
         if args.target_kl is not None and mean_log(logs[-args.num_minibatches :])["approx_kl"] > args.target_kl:
             break
 
     losses = mean_log(logs)
-    # Before the first gradient step the weights are the rollout's, and so must be every probability.
+    # Before the first gradient step the weights are those that acted, and so must be every probability.
     losses["ratio_error"] = logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
-    padding = 1 - float(pieces.length.float().mean() / pieces.length.max())
-    charts = {"padding_fraction": padding, **agent.memory.logs(rollout.memory)}
+    padding = 1 - float(pieces.length.float().mean() / pieces.length.max())  # if all were padded to the longest
+    charts = {"padding_fraction": padding, **agent.memory.logs(rollout.memory_state)}
     return {f"losses/{k}": v for k, v in losses.items()} | {f"charts/{k}": v for k, v in charts.items()}
 
 
 def mean_log(logs: list[dict[str, Tensor]]) -> dict[str, float]:
-    """Return the mean of each number over the minibatches; a GPU is asked once for all of them."""
+    """Return the mean of each metric over the minibatches, with one GPU synchronization for all of them."""
     means = torch.stack([torch.stack([*log.values()]) for log in logs]).mean(0)
     return dict(zip(logs[0], means.tolist(), strict=True))
 
@@ -860,7 +854,7 @@ def train(args: Args, run: "Run") -> None:
         logs = update(agent, run.optimizer, rollout, ent_coef, args)
 
         if not math.isfinite(logs["losses/grad_norm"]):
-            raise FloatingPointError("the training diverged: its gradient is no finite number; try a lower --init-lr")
+            raise FloatingPointError("the training diverged: its gradient is not finite; try a lower --init-lr")
         run.seconds += time.perf_counter() - began
         logs |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
         report(args, run, step + batch_size, logs, episodes)  # section 8: evaluation, TensorBoard, progress bar
@@ -875,25 +869,25 @@ def evaluation_levels(args: Args) -> list[int]:
 
 @torch.no_grad()
 def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps: int = 64) -> dict[str, np.ndarray]:
-    """Play each of `evaluation_levels` in an environment of its own, with the stochastic policy (6.1.3).
+    """Play each of `evaluation_levels` in an environment of its own, with the stochastic policy (§6.1.3).
 
-    Returns numbers (N,) by name: return, length, finished (0 for an episode that was cut short), and every number in
+    Returns metrics (N,) by name: return, length, finished (0 for an episode that was cut short), and every number in
     an episode's final info. The memory begins empty, and has room for memory_steps steps at a time.
     """
     levels = evaluation_levels(args)
     device, options = next(agent.parameters()).device, parse_options(args.env_id, args.env_options)
     obs, _ = envs.reset(seed=levels, options=options)
-    memory = agent.memory.initial_state(len(levels), memory_steps, device)
+    state = agent.memory.initial_state(len(levels), memory_steps, device)
     playing = np.ones(len(levels), bool)
-    found = {name: np.zeros(len(levels)) for name in ("return", "length", "finished")}
+    found = {"return": np.zeros(len(levels)), "length": np.zeros(len(levels))}
     with autocast(args, device):
         for t in range(args.eval_max_steps):
             if t % memory_steps == 0:
-                memory = agent.memory.begin_rollout(memory)
-            actions, _, _, memory = agent.act(as_tensors(obs, device), memory)
+                state = agent.memory.begin_rollout(state)
+            actions, _, _, state = agent.act(as_tensors(obs, device), state)
             obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
             done = terminated | truncated
-            memory = agent.memory.reset(memory, torch.as_tensor(done))
+            state = agent.memory.reset(state, torch.as_tensor(done))
             found["return"] += rewards * playing
             found["length"] += playing
             for name, which, values in final_numbers(infos, done & playing):
@@ -905,10 +899,11 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
 
 
 def level_scores(args: Args, run: "Run") -> dict[str, Tensor]:
-    """Return an evaluation's numbers by name, each level's mean over its repeats, (--eval-levels,) float64.
+    """Return an evaluation's metrics by name, each level's mean over its repeats, (--eval-levels,) float64.
 
     Training goes on as if there had been none. What only an episode's end tells is left out if an episode was cut
-    short: the best ones would be missing. An episode that the memory cannot hold costs the evaluation, with a line.
+    short: the best ones would be missing. An episode that is too long for the memory ends the evaluation with a warning
+    and without metrics.
     """
     device = run.rollout.values.device
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
@@ -950,20 +945,20 @@ def parse_args(argv: list[str]) -> Args:
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", choices=PRESETS, default="thesis")
     preset = first.parse_known_args(argv)[0].preset
-    held = [f"{flag(name)} {value}" for name, value in PRESETS["laptop"].items()]
-    description = f"{Args.__doc__} The defaults are the thesis'; --preset laptop stands for {' '.join(held)}"
+    laptop = " ".join(f"{flag(name)} {value}" for name, value in PRESETS["laptop"].items())
+    description = f"{Args.__doc__} The defaults are the thesis'; --preset laptop stands for {laptop}"
     return tyro.cli(Args, args=argv, default=Args(preset=preset, **PRESETS[preset]), description=description)
 
 
 def check_args(args: Args) -> None:
     """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work."""
     for name, kind in get_type_hints(Args, include_extras=True).items():
-        value = getattr(args, name)
-        for bounds in (each for part in (kind, *get_args(kind)) for each in getattr(part, "__metadata__", ())):
+        value, parts = getattr(args, name), (kind, *get_args(kind))  # float | None has its bounds in a part
+        for bounds in (each for part in parts for each in getattr(part, "__metadata__", ())):
             if isinstance(bounds, Bounds) and value is not None and not bounds.allow(value):
-                raise ValueError(f"{flag(name)} is {value}; it must be {bounds}")
-            if isinstance(value, int) and value >= 2**63:
-                raise ValueError(f"{flag(name)} is {value}; it must be below 2 ** 63")
+                raise ValueError(f"{flag(name)} is {value}; it must be {bounds.text}")
+        if isinstance(value, int) and value >= 2**63:  # torch and NumPy take no more
+            raise ValueError(f"{flag(name)} is {value}; it must be below 2 ** 63")
     if not args.exp_name or set(args.exp_name) & set("/\\"):
         raise ValueError(f"--exp-name is {args.exp_name!r}; it must be a name without slashes")
     batch_size = args.num_envs * args.num_steps
@@ -972,7 +967,7 @@ def check_args(args: Args) -> None:
             f"--total-timesteps is {args.total_timesteps}, less than one iteration of {batch_size} steps "
             f"(--num-envs {args.num_envs} x --num-steps {args.num_steps})"
         )
-    longest = check_memory_args(args)
+    longest = longest_piece(args)
     if args.num_minibatches * longest > batch_size:
         raise ValueError(
             f"--num-minibatches is {args.num_minibatches}, but an iteration may have only {batch_size // longest} "
@@ -982,9 +977,9 @@ def check_args(args: Args) -> None:
 
 def environments(args: Args, num_envs: int, **kwargs: Any) -> gym.vector.VectorEnv:
     """Make the environments that the arguments describe; kwargs and errors are those of `make_envs`."""
-    names = ("num_levels", "start_level", "obs_type", "frame_stack", "step_encoding")
-    names += ("observe_last_action", "spotlight_perturbation")
-    return make_envs(args.env_id, num_envs, **{name: getattr(args, name) for name in names}, **kwargs)
+    levels = {"num_levels": args.num_levels, "start_level": args.start_level, "obs_type": args.obs_type}
+    wrappers = ("frame_stack", "step_encoding", "observe_last_action", "spotlight_perturbation")
+    return make_envs(args.env_id, num_envs, **levels, **{name: getattr(args, name) for name in wrappers}, **kwargs)
 
 
 def make_agent(envs: gym.vector.VectorEnv, infos: dict, args: Args, device: torch.device) -> Agent:
@@ -1023,7 +1018,8 @@ def setup(args: Args) -> Run:
     if args.load_model is not None:
         load_weights(agent, read_model(args.load_model), args.load_model)
     speed_up(agent, args, rollout.next_obs)
-    optimizer = torch.optim.AdamW(agent.parameters(), lr=torch.tensor(args.init_lr), fused=True)
+    # As a tensor, the learning rate is set in place; the weight decay is torch's default.
+    optimizer = torch.optim.AdamW(agent.parameters(), lr=torch.tensor(args.init_lr), weight_decay=0.01, fused=True)
     if args.track:
         start_tracking(args, folder.name)
     writer = open_writer(args, folder)
@@ -1038,12 +1034,12 @@ def enough_memory(args: Args, device: torch.device) -> Iterator[None]:
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and "memory" not in str(error):
+        if isinstance(error, RuntimeError) and "allocate" not in str(error):
             raise
-        numbers = [(each, getattr(args, each.name)) for each in fields(Args) if type(each.default) is int]
-        large = [f"{flag(each.name)} {value}" for each, value in numbers if value > each.default]
-        large = [name for name in large if not name.startswith(("--seed", "--total", "--start", "--anneal"))]
-        large = " ".join(large) or f"--num-envs {args.num_envs} --num-steps {args.num_steps}"
+        harmless = ("seed", "total_timesteps", "start_level", "anneal_steps")
+        sizes = [each for each in fields(Args) if type(each.default) is int and each.name not in harmless]
+        large = [each.name for each in sizes if getattr(args, each.name) > each.default] or ["num_envs", "num_steps"]
+        large = " ".join(f"{flag(name)} {getattr(args, name)}" for name in large)
         raise ValueError(f"this does not fit in the memory of {device}; use less of {large}") from None
 
 
@@ -1107,9 +1103,9 @@ def report(args: Args, run: Run, step: int, logs: dict[str, float], episodes: di
 
 
 def save_model(agent: Agent, args: Args, path: str | Path) -> None:
-    """Write weights, arguments and the script's name to path, whole or not at all.
+    """Write weights, arguments and the script's name to path, atomically.
 
-    Raises FloatingPointError, and writes nothing, if a weight is no finite number.
+    Raises FloatingPointError, and writes nothing, if a weight is not finite.
     """
     if not all(weight.isfinite().all() for weight in agent.state_dict().values()):
         raise FloatingPointError(f"the training diverged: {path} is not written; try a lower --init-lr")
@@ -1128,7 +1124,7 @@ def read_model(path: str | Path) -> dict[str, Any]:
     try:
         with open(path, "rb") as file:
             saved = torch.load(file, map_location="cpu", weights_only=True)
-        return {"script": saved["script"], "args": {**saved["args"]}, "weights": {**saved["weights"]}}
+        return {"script": saved["script"], "args": dict(saved["args"]), "weights": dict(saved["weights"])}
     except OSError:
         raise
     except Exception:  # what torch.load raises for a file of another kind is many things, and none tells more
@@ -1136,7 +1132,7 @@ def read_model(path: str | Path) -> dict[str, Any]:
 
 
 def saved_args(saved: dict[str, Any]) -> Args:
-    """Return the arguments in what `read_model` read; a flag that is younger than the file has its default."""
+    """Return the arguments in what `read_model` read; a flag that is newer than the file has its default."""
     known = {each.name for each in fields(Args)}
     return Args(**{name: value for name, value in saved["args"].items() if name in known})
 
@@ -1144,7 +1140,7 @@ def saved_args(saved: dict[str, Any]) -> Args:
 def load_weights(agent: Agent, saved: dict[str, Any], path: str | Path) -> None:
     """Give the agent the weights in what `read_model` read; auxiliary heads may be added to it or left out.
 
-    Raises ValueError if they are another script's or another network's, or no finite numbers.
+    Raises ValueError if they are another script's or another network's, or not finite.
     """
     if saved["script"] != Path(__file__).stem:
         raise ValueError(f"{path} was trained by {saved['script']}.py, not by {Path(__file__).name}")
@@ -1153,10 +1149,10 @@ def load_weights(agent: Agent, saved: dict[str, Any], path: str | Path) -> None:
         if not all(name.startswith(("decoder.", "estimator.")) for name in (*missing, *unexpected)):
             raise RuntimeError
     except (RuntimeError, TypeError):
-        theirs = " ".join(f"{flag(name)} {getattr(saved_args(saved), name)}" for name in SHAPING)
+        theirs = " ".join(f"{flag(name)} {getattr(saved_args(saved), name)}" for name in NETWORK_FLAGS)
         raise ValueError(f"{path} holds the weights of another network, trained with {theirs}") from None
     if not all(weight.isfinite().all() for weight in saved["weights"].values()):
-        raise ValueError(f"{path} holds weights that are no finite numbers: the training diverged")
+        raise ValueError(f"{path} holds weights that are not finite: the training diverged")
 
 
 def close(args: Args, run: Run) -> None:
@@ -1172,9 +1168,9 @@ def close(args: Args, run: Run) -> None:
 
 
 def run_to_end(args: Args, run: Run) -> Path:
-    """Train until it is done or Ctrl-C; return the run folder. Whatever ends the training, what was learned is kept.
+    """Train until it is done or Ctrl-C; return the run folder. Raises what `train` and `close` raise.
 
-    Raises what `train` and `close` raise.
+    With --save-model, what was learned is kept, whatever ends the training; but for weights that are not finite.
     """
     try:
         train(args, run)
@@ -1192,23 +1188,24 @@ def main(args: Args) -> Path:
 
 # ---- 9 FAST PATHS ----
 class UniqueObservations:
-    """The observations of a rollout, of which `take` returns equal ones once.
+    """The observations of a rollout, of which equal ones are encoded once in a minibatch.
 
-    Where pictures are encoded on a CPU, the encoder is most of the work, and in grid tasks most pictures repeat.
-    Elsewhere every observation stands for itself. The gradient is the same.
+    On a CPU the encoder of images is most of the work, and in grid tasks most images repeat. Elsewhere every
+    observation is encoded. The gradient is the same, up to rounding.
     """
 
     def __init__(self, obs: dict[str, Tensor], agent: Agent):
         self.obs = {name: part.flatten(0, 1) for name, part in obs.items()}  # (T * N, ...)
         on_cpu = all(part.device.type == "cpu" for part in obs.values())
-        self.first_occurrence = first_occurrences(self.obs) if agent.encoder.pictures and on_cpu else None
+        self.first_occurrence = first_occurrences(self.obs) if agent.encoder.images and on_cpu else None
 
-    def take(self, index: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-        """Return the different observations at the flat indices (B,), and which of them each index had, (B,)."""
-        which = torch.arange(len(index), device=index.device)
+    def encode(self, encoder: Encoder, index: Tensor) -> Tensor:
+        """Encode the observations at the flat indices (B,): (B, D)."""
+        inverse = None
         if self.first_occurrence is not None:
-            index, which = self.first_occurrence[index].unique(return_inverse=True)
-        return {name: part.index_select(0, index) for name, part in self.obs.items()}, which
+            index, inverse = self.first_occurrence[index].unique(return_inverse=True)
+        x = encoder({name: part.index_select(0, index.to(part.device)) for name, part in self.obs.items()})
+        return x if inverse is None else x.index_select(0, inverse)
 
 
 def first_occurrences(obs: dict[str, Tensor]) -> Tensor:
@@ -1240,23 +1237,24 @@ def speed_up(agent: Agent, args: Args, obs: dict[str, np.ndarray]) -> None:
         for layers in (agent.heads.trunk, agent.heads.policy, agent.heads.value):
             layers.compile(dynamic=True)
     if args.amp and on_cpu:
-        agent.encoder.forward = with_even_rows(agent.encoder.forward)
-        agent.heads.forward = with_even_rows(agent.heads.forward)
+        agent.encoder.forward = pad_batch(agent.encoder.forward)
+        agent.heads.forward = pad_batch(agent.heads.forward)
     if args.compile:
-        compile_now(agent, obs)
+        compile_now(agent, args, obs)
 
 
-def compile_now(agent: Agent, obs: dict[str, np.ndarray]) -> None:
-    """Run what is to be compiled once, a full chunk of pictures; raise ValueError if the compiler fails."""
+def compile_now(agent: Agent, args: Args, obs: dict[str, np.ndarray]) -> None:
+    """Run what is to be compiled once, on a full chunk; raise ValueError if the compiler fails."""
     device = next(agent.parameters()).device
     chunk = {name: part[:1].expand(CHUNK, *part.shape[1:]) for name, part in as_tensors(obs, device).items()}
     try:
-        agent.heads(agent.encoder(chunk))
+        with autocast(args, device):
+            agent.heads(agent.encoder(chunk))
     except Exception as error:  # whatever the compiler raises
         raise ValueError(f"--compile: {error}; install a C++ compiler (g++), or leave --compile out") from None
 
 
-CHUNK = 256  # pictures; the backward pass of 2,048 at once takes about 1.5 times as long on a CPU, for its caches
+CHUNK = 256  # images; the backward pass of 2,048 at once takes about 1.5 times as long on a CPU, for its caches
 
 
 def in_chunks(forward: Callable, forward_rest: Callable) -> Callable:
@@ -1272,14 +1270,14 @@ def in_chunks(forward: Callable, forward_rest: Callable) -> Callable:
     return chunked
 
 
-def with_even_rows(forward: Callable, multiple: int = 16) -> Callable:
-    """Return a function that computes with a number of rows rounded up to a multiple, and drops the rest again.
+def pad_batch(forward: Callable, multiple: int = 16) -> Callable:
+    """Return a function that computes with a batch padded to a multiple, and drops the padding again.
 
-    In bfloat16, a CPU's kernels are compiled for every number of rows, which can take longer than running them.
+    In bfloat16, a CPU's kernels are compiled for every batch size, which can take longer than running them.
     """
 
     def pad(x: Tensor) -> Tensor:
-        return F.pad(x, (*(x.dim() - 1) * (0, 0), 0, -len(x) % multiple))
+        return F.pad(x, [0, 0] * (x.dim() - 1) + [0, -len(x) % multiple])
 
     def padded(x: Tensor | dict[str, Tensor]) -> Tensor | tuple[Tensor, ...]:
         rows = len(next(iter(x.values())) if isinstance(x, dict) else x)
@@ -1295,9 +1293,9 @@ def packed_gru(rnn: nn.GRU, x: Tensor, pieces: Pieces, hidden: Tensor) -> Tensor
     Computes what `Memory.unroll` does with padding. The order is that of torch's PackedSequence: the first step of all
     sequences, the longest first, then the second step of those that have one, and so on.
     """
-    column = pieces.positions().expand(len(pieces.length), -1)[pieces.is_real()]  # (B,) the step's place in its piece
+    column = pieces.columns().expand(len(pieces.length), -1)[pieces.is_step()]  # (B,) of the step in its sequence
     longest_first = pieces.length.argsort(descending=True)
-    rank = longest_first.argsort().repeat_interleave(pieces.length)  # (B,) of the step's piece
+    rank = longest_first.argsort().repeat_interleave(pieces.length)  # (B,) of the step's sequence
     order = (column * len(longest_first) + rank).argsort()
     sizes = column.bincount().tolist()  # (L,) number of sequences that have a first step, a second ...
     y, hidden = x[order], hidden[longest_first].transpose(0, 1)  # (B, D), (P, S, D)

@@ -53,7 +53,7 @@ def kept_for_backward(run, args: ppo_trxl.Args) -> list[torch.Tensor]:
     minibatch = next(memory.cut(rollout.terminated).minibatches(args.num_minibatches))
     x = torch.randn(int(minibatch.length.sum()), memory.width, requires_grad=True)
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        memory.unroll(x, minibatch, rollout.memory)
+        memory.unroll(x, minibatch, rollout.memory_state)
     weights = {parameter.untyped_storage().data_ptr() for parameter in memory.parameters()}
     return [tensor for tensor in kept if tensor.untyped_storage().data_ptr() not in weights]
 
@@ -64,7 +64,7 @@ def shares(config: Config) -> None:
     run = ppo_trxl.setup(args)
     ppo_trxl.train(args, run)
     resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6  # kilobytes on Linux
-    memory = run.rollout.memory
+    memory = run.rollout.memory_state
     rows = {
         "highest resident memory, all in all": resident,
         "stored block inputs": megabytes([memory.items, memory.item_steps]),

@@ -46,7 +46,8 @@ def scalars():
 
 @pytest.fixture
 def played(tiny):
-    """Set up an agent and play some rollouts, without learning; the last one stays in run.rollout."""
+    """Set up an agent and play some rollouts, without learning; the last one stays in run.rollout, its
+    advantages and returns are zeros."""
 
     def play(iterations=1, weights_scale=1.0, script=ppo_gru, **changes):
         args = tiny(script, **changes)
@@ -56,6 +57,7 @@ def played(tiny):
                 parameter.mul_(weights_scale)
         for _ in range(iterations):
             last_value, episodes = script.collect(run.agent, run.envs, run.rollout, args)
+        run.rollout.advantages, run.rollout.returns = torch.zeros(2, *run.rollout.values.shape)
         return args, run, last_value, episodes
 
     return play

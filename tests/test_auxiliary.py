@@ -63,7 +63,8 @@ def test_the_losses_are_means_over_real_steps(played, script):
     obs = {name: part.flatten(0, 1)[order] for name, part in run.rollout.obs.items()}
     with torch.no_grad():
         actions = run.rollout.actions.flatten(0, 1)[order]
-        features = run.agent.evaluate_actions(obs, torch.arange(64), actions, pieces, run.rollout.memory)[3]
+        observations = script.UniqueObservations(run.rollout.obs, run.agent)
+        features = run.agent.evaluate_actions(observations, actions, pieces, run.rollout.memory_state)[3]
         drawn = torch.sigmoid(run.agent.decoder(features))
         wanted = obs["visual_observation"] / 255
         truths = run.rollout.ground_truth.flatten(0, 1)[order]
@@ -147,7 +148,7 @@ def test_both_losses_fall(tiny, scalars, script):
             {"env_id": "CueRecall-v0", "ground_truth_coef": 0.1},
             "needs an environment that has ground_truth, an array",
         ),
-        ({"env_id": "CueRecall-v0", "reconstruction_coef": 0.1}, "needs an observation with one picture, not 0"),
+        ({"env_id": "CueRecall-v0", "reconstruction_coef": 0.1}, "needs an observation with one image, not 0"),
         ({"reconstruction_coef": -1.0}, "--reconstruction-coef is -1.0; it must be 0 or more"),
     ],
 )

@@ -45,7 +45,7 @@ TRANSFORMER_CASES = {
     "--trxl-num-heads 5": "--trxl-dim is 384; it must be even and a multiple of --trxl-num-heads",
     "--trxl-dim 9 --trxl-num-heads 3": "--trxl-dim is 9; it must be even",
     "--trxl-memory-length 0": "--trxl-memory-length is 0; it must be 1 or more",
-    "--trxl-gate-bias inf": "--trxl-gate-bias is inf; it must be any finite number",
+    "--trxl-gate-bias inf": "--trxl-gate-bias is inf; it must be a finite number",
     "--num-minibatches 200": "may have only 128 pieces to deal .* or shorter pieces",
 }
 
@@ -187,7 +187,7 @@ def test_a_training_that_diverges(tiny, script):
     next(run.agent.parameters()).data.fill_(float("nan"))
     torch.save({"script": script.__name__, "args": {}, "weights": run.agent.state_dict()}, "spoilt.pt")
     message = setup_error(tiny(script, env_id="CueRecall-v0", load_model="spoilt.pt"), script)
-    assert message == "spoilt.pt holds weights that are no finite numbers: the training diverged"
+    assert message == "spoilt.pt holds weights that are not finite: the training diverged"
 
 
 def test_a_compiler_that_is_missing(tiny, monkeypatch):

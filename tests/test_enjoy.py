@@ -402,7 +402,7 @@ def test_diverged_weights(saved):
     model = torch.load("model.pt", weights_only=True)
     model["weights"]["heads.value.2.bias"].fill_(torch.nan)
     torch.save(model, "model.pt")
-    with pytest.raises(ValueError, match="holds weights that are no finite numbers: the training diverged"):
+    with pytest.raises(ValueError, match="holds weights that are not finite: the training diverged"):
         enjoy.main(enjoy.Config("model.pt"))
 
 

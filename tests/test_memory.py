@@ -33,9 +33,8 @@ def recompute(run):
     rollout = run.rollout
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
     index = pieces.flat_index()
-    obs = {name: part.flatten(0, 1)[index] for name, part in rollout.obs.items()}
-    actions, which = rollout.actions.flatten(0, 1)[index], torch.arange(len(index))
-    log_probs, _, values, _ = run.agent.evaluate_actions(obs, which, actions, pieces, rollout.memory)
+    observations, actions = ppo_gru.UniqueObservations(rollout.obs, run.agent), rollout.actions.flatten(0, 1)[index]
+    log_probs, _, values, _ = run.agent.evaluate_actions(observations, actions, pieces, rollout.memory_state)
     return index, (log_probs - rollout.log_probs.flatten(0, 1)[index]).exp(), values
 
 
@@ -85,7 +84,7 @@ def test_ratio_is_nearly_one_when_compiled(played, script):
 def test_ratio_error_sees_a_broken_memory(played, memory):
     """Guards the guard: with what the memory stored lost, the ratios are off."""
     _, run, *_ = played(iterations=3, weights_scale=3.0, env_id="CueRecall-v0", **memory)
-    state = run.rollout.memory
+    state = run.rollout.memory_state
     (state.stored if memory in RECURRENT else state.items).zero_()
     assert (recompute(run)[1] - 1).abs().max() > 1e-4
 
@@ -102,7 +101,7 @@ def test_an_episode_begins_with_an_empty_memory(played, memory):
     rollout = played(env_id="CueRecall-v0", **memory)[1].rollout
     begins = rollout.terminated[:-1]
     assert begins.any()
-    stored = rollout.memory.stored
+    stored = rollout.memory_state.stored
     assert (stored[1:-1][begins] == 0).all()
     assert (stored[1:-1][~begins].abs().sum((-1, -2)) > 0).all(), "and goes on where none ended"
     assert (stored[0] == 0).all()
@@ -145,7 +144,7 @@ def test_no_gradient_crosses_the_end_of_an_episode(played, memory):
     rollout = run.rollout
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
     x = torch.randn(int(pieces.length.sum()), 32, requires_grad=True)
-    y = run.agent.memory.unroll(x, pieces, rollout.memory)
+    y = run.agent.memory.unroll(x, pieces, rollout.memory_state)
     ends = pieces.length.cumsum(0)
     piece = int((pieces.length > 2).nonzero()[1, 0])
     first, last = int(ends[piece] - pieces.length[piece]), int(ends[piece] - 1)
@@ -171,7 +170,7 @@ def test_gru_equals_a_loop_over_cells():
 @pytest.mark.parametrize("memory", TRANSFORMER)
 def test_an_episode_s_first_step_is_the_same_whatever_came_before(played, memory):
     _, run, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
-    agent, state = run.agent, run.rollout.memory
+    agent, state = run.agent, run.rollout.memory_state
     obs = {"observation": torch.randn(4, 3)}
     with torch.no_grad():
         fresh = agent.get_value(obs, agent.memory.initial_state(4, 16, torch.device("cpu")))
@@ -237,7 +236,7 @@ def test_a_long_episode_takes_no_more_memory_than_a_short_one(played):
         ppo_gru.collect(run.agent, run.envs, run.rollout, args)
     assert run.envs.episode_lengths[0] > 900
     assert storage() == before
-    assert run.rollout.memory.hidden.shape == (1, 1, 4)
+    assert run.rollout.memory_state.hidden.shape == (1, 1, 4)
 
 
 def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(played):
@@ -245,17 +244,17 @@ def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(pl
     changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"explosion_delay": [1000]}'}
     args, run, *_ = played(script=ppo_trxl, num_envs=1, num_steps=50, num_minibatches=1, **changes)
     # As if the episode had been going on for long; its window is still that of 50 steps.
-    run.rollout.memory.episode_step.add_(4050)
+    run.rollout.memory_state.episode_step.add_(4050)
 
     def storage():
-        state = run.rollout.memory
+        state = run.rollout.memory_state
         return [(part.data_ptr(), part.shape) for part in (state.keys, state.values, state.items, state.item_steps)]
 
     before = storage()
     for _ in range(19):
         ppo_trxl.collect(run.agent, run.envs, run.rollout, args)
         assert recompute(run)[1].sub(1).abs().max() < 1e-5
-    assert run.rollout.memory.episode_step > 5000
+    assert run.rollout.memory_state.episode_step > 5000
     assert storage() == before
 
 
@@ -349,10 +348,12 @@ def test_acting_and_learning_ask_no_device_for_numbers(played, monkeypatch, memo
     def moved(part):
         return part.to("meta") if isinstance(part, torch.Tensor) else part
 
-    state = run.rollout.memory
+    state = run.rollout.memory_state
     state = state._replace(**{name: moved(part) for name, part in state._asdict().items() if name not in on_cpu})
     parts = {name: moved(part) for name, part in vars(run.rollout).items()}
-    rollout = script.Rollout(**parts | {"obs": {k: v.to("meta") for k, v in run.rollout.obs.items()}, "memory": state})
+    rollout = script.Rollout(
+        **parts | {"obs": {k: v.to("meta") for k, v in run.rollout.obs.items()}, "memory_state": state}
+    )
     obs = {name: part[0] for name, part in rollout.obs.items()}
     with NoQuestions(), torch.no_grad():
         state = agent.memory.begin_rollout(state)
