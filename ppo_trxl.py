@@ -32,9 +32,9 @@ import os
 import signal
 import sys
 import time
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
 
@@ -1169,8 +1169,6 @@ class Run:
     writer: SummaryWriter
     bar: tqdm
     seconds: float = 0.0  # of training, without evaluations
-    returns: deque = field(default_factory=lambda: deque(maxlen=100))  # of the last episodes, for the progress bar
-    lengths: deque = field(default_factory=lambda: deque(maxlen=100))
 
 
 def flag(name: str) -> str:
@@ -1209,7 +1207,7 @@ def check_args(args: Args) -> None:
     if args.num_minibatches * longest > batch_size:
         raise ValueError(
             f"--num-minibatches is {args.num_minibatches}, but an iteration may have only {batch_size // longest} "
-            f"pieces to deal (up to {longest} of {batch_size} steps each); use that many or shorter pieces"
+            f"pieces (up to {longest} of {batch_size} steps each); use that many or shorter pieces"
         )
 
 
@@ -1323,8 +1321,8 @@ def start_tracking(args: Args, name: str) -> None:
 def report(args: Args, run: Run, step: int, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
     """Write an iteration's numbers to TensorBoard and the progress bar; evaluate first where that is due."""
     batch_size = args.num_envs * args.num_steps
-    last = step + batch_size > args.total_timesteps
-    if run.eval_envs is not None and (step // batch_size % args.eval_interval == 0 or last):
+    is_last = step + batch_size > args.total_timesteps
+    if run.eval_envs is not None and (step // batch_size % args.eval_interval == 0 or is_last):
         for name, scores in level_scores(args, run).items():
             logs[f"eval/{name}"] = scores.mean().item()
             run.writer.add_tensor(f"eval_levels/{name}", scores, step)
@@ -1332,10 +1330,8 @@ def report(args: Args, run: Run, step: int, logs: dict[str, float], episodes: di
     logs["charts/SPS"] = step / run.seconds
     for name, value in logs.items():
         run.writer.add_scalar(name, value, step)
-    run.returns.extend(episodes.get("charts/episodic_return", []))
-    run.lengths.extend(episodes.get("charts/episodic_length", []))
-    shown = {"return": run.returns, "length": run.lengths}
-    shown = {name: f"{np.mean(window):.2f}" for name, window in shown.items() if window}
+    last = {"return": run.envs.return_queue, "length": run.envs.length_queue}  # of the last 100 episodes
+    shown = {name: f"{np.mean(queue):.2f}" for name, queue in last.items() if queue}
     run.bar.set_postfix({**shown, "SPS": f"{logs['charts/SPS']:.0f}"}, refresh=False)
     run.bar.update(batch_size)
 

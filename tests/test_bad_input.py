@@ -46,7 +46,7 @@ TRANSFORMER_CASES = {
     "--trxl-dim 9 --trxl-num-heads 3": "--trxl-dim is 9; it must be even",
     "--trxl-memory-length 0": "--trxl-memory-length is 0; it must be 1 or more",
     "--trxl-gate-bias inf": "--trxl-gate-bias is inf; it must be a finite number",
-    "--num-minibatches 200": "may have only 128 pieces to deal .* or shorter pieces",
+    "--num-minibatches 200": "may have only 128 pieces .* or shorter pieces",
 }
 
 
