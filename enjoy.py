@@ -113,7 +113,7 @@ def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, options: dict 
     torch.manual_seed(seed)
     episode = Episode()
     obs, infos = envs.reset(seed=seed, options=options)
-    memory = agent.memory.initial_state(1, max_steps, torch.device("cpu"))
+    memory = agent.memory.begin_rollout(agent.memory.initial_state(1, max_steps, torch.device("cpu")))
     while not episode.finished and len(episode.actions) < max_steps:
         for name, frame in views(envs, obs).items():
             episode.film(name, frame)

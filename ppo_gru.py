@@ -29,9 +29,9 @@ import os
 import signal
 import sys
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
 
@@ -46,7 +46,14 @@ from torch.nn.utils.rnn import pad_sequence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from memory_gym_envs.making import final_numbers, final_observations, make_envs, parse_options
+from memory_gym_envs.making import (
+    LaneVideo,
+    check_can_film,
+    final_numbers,
+    final_observations,
+    make_envs,
+    parse_options,
+)
 
 
 # ---- 1 ARGS ----
@@ -64,8 +71,8 @@ def bounded(kind: type, text: str, allow: Callable[[float], bool]) -> Any:
 
 PositiveInt = bounded(int, "1 or more", lambda x: x >= 1)
 NonNegativeInt = bounded(int, "0 or more", lambda x: x >= 0)
-PositiveFloat = bounded(float, "above 0", lambda x: 0 < x < math.inf)
-NonNegativeFloat = bounded(float, "0 or more", lambda x: 0 <= x < math.inf)
+PositiveFloat = bounded(float, "above 0", lambda x: x > 0)
+NonNegativeFloat = bounded(float, "0 or more", lambda x: x >= 0)
 UnitInterval = bounded(float, "0 to 1", lambda x: 0 <= x <= 1)
 
 
@@ -76,7 +83,7 @@ class Args:
     exp_name: str = "ppo_gru"
     """name of the experiment, part of the run folder's name"""
     preset: Literal["thesis", "laptop"] = "thesis"
-    """a set of defaults, see PRESETS; flags that are given win over it"""
+    """a set of defaults, told above, that the command line begins with; flags that are given win over it"""
     seed: NonNegativeInt = 1
     """seed of the weights, the actions and the environments: same seed, same curves (on the CPU to the last bit)"""
     torch_deterministic: bool = True
@@ -209,8 +216,18 @@ PRESETS = {
     },
 }
 # What shapes the network; an error message names these if weights do not fit.
-NETWORK_FLAGS = ("env_id", "obs_type", "frame_stack", "step_encoding", "observe_last_action", "vector_frequencies")
-NETWORK_FLAGS = (*NETWORK_FLAGS, "head_size", "memory", "hidden_size", "num_layers")
+NETWORK_FLAGS = (
+    "env_id",
+    "obs_type",
+    "frame_stack",
+    "step_encoding",
+    "observe_last_action",
+    "vector_frequencies",
+    "head_size",
+    "memory",
+    "hidden_size",
+    "num_layers",
+)
 
 
 def longest_piece(args: Args) -> int:
@@ -797,8 +814,9 @@ def update(
     observations = UniqueObservations(rollout.obs, agent)
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
     # A detached estimator is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
-    probe = [*agent.estimator.parameters()] if args.ground_truth_detach and agent.estimator is not None else []
-    parameters = [parameter for parameter in agent.parameters() if not any(parameter is each for each in probe)]
+    probe, parameters = [], []
+    for name, parameter in agent.named_parameters():
+        (probe if args.ground_truth_detach and name.startswith("estimator.") else parameters).append(parameter)
     logs = []
     for _ in range(args.update_epochs):
         for minibatch in pieces.minibatches(args.num_minibatches):
@@ -931,6 +949,8 @@ class Run:
     writer: SummaryWriter
     bar: tqdm
     seconds: float = 0.0  # of training, without evaluations
+    returns: deque = field(default_factory=lambda: deque(maxlen=100))  # of the last episodes, for the progress bar
+    lengths: deque = field(default_factory=lambda: deque(maxlen=100))
 
 
 def flag(name: str) -> str:
@@ -941,11 +961,11 @@ def flag(name: str) -> str:
 def parse_args(argv: list[str]) -> Args:
     """Parse a command line; its flags win over what --preset holds."""
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--preset", choices=PRESETS, default="thesis")
-    preset = first.parse_known_args(argv)[0].preset
+    first.add_argument("--preset")
+    held = PRESETS.get(first.parse_known_args(argv)[0].preset, {})  # an unknown one is told by tyro, as all errors are
     laptop = " ".join(f"{flag(name)} {value}" for name, value in PRESETS["laptop"].items())
-    description = f"{Args.__doc__} The defaults are the thesis'; --preset laptop stands for {laptop}"
-    return tyro.cli(Args, args=argv, default=Args(preset=preset, **PRESETS[preset]), description=description)
+    description = f"{Args.__doc__} The defaults are the thesis'. --preset laptop stands for {laptop}"
+    return tyro.cli(Args, args=argv, default=Args(**held), description=description)
 
 
 def check_args(args: Args) -> None:
@@ -1003,10 +1023,12 @@ def setup(args: Args) -> Run:
     device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")  # TF32
-    options, folder = parse_options(args.env_id, args.env_options), new_folder(args)
+    options = parse_options(args.env_id, args.env_options)
+    if args.capture_video:
+        check_can_film(args.env_id)
     with enough_memory(args, device):
-        videos = str(folder / "videos") if args.capture_video else None
-        envs = environments(args, args.num_envs, seed=args.seed, options=options, video_folder=videos)
+        mode = "debug_rgb_array" if args.capture_video else None
+        envs = environments(args, args.num_envs, seed=args.seed, options=options, render_mode=mode)
         obs, infos = envs.reset(options=options)
         agent = make_agent(envs, infos, args, device)
         rollout = Rollout.allocate(
@@ -1018,9 +1040,13 @@ def setup(args: Args) -> Run:
     speed_up(agent, args, rollout.next_obs)
     # As a tensor, the learning rate is set in place; the weight decay is torch's default.
     optimizer = torch.optim.AdamW(agent.parameters(), lr=torch.tensor(args.init_lr), weight_decay=0.01, fused=True)
+
+    folder = new_folder(args)
     if args.track:
         start_tracking(args, folder.name)
     writer = open_writer(args, folder)
+    if args.capture_video:
+        envs = LaneVideo(envs, str(folder / "videos"))
     batch_size = args.num_envs * args.num_steps
     bar = tqdm(total=args.total_timesteps // batch_size * batch_size, unit=" steps", unit_scale=True)
     return Run(envs, eval_envs, agent, optimizer, rollout, folder, writer, bar)
@@ -1055,7 +1081,7 @@ def open_writer(args: Args, folder: Path) -> SummaryWriter:
     Raises OSError if the folder cannot be made.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True)
     except OSError as error:
         raise OSError(f"cannot make {folder} ({error.strerror}); run where the folder runs can be written") from None
     writer = SummaryWriter(str(folder))
@@ -1092,8 +1118,9 @@ def report(args: Args, run: Run, step: int, logs: dict[str, float], episodes: di
     logs["charts/SPS"] = step / run.seconds
     for name, value in logs.items():
         run.writer.add_scalar(name, value, step)
-    last = {"return": run.envs.return_queue, "length": run.envs.length_queue}  # of the last 100 episodes
-    shown = {name: f"{np.mean(queue):.2f}" for name, queue in last.items() if queue}
+    run.returns.extend(episodes.get("charts/episodic_return", []))
+    run.lengths.extend(episodes.get("charts/episodic_length", []))
+    shown = {name: f"{np.mean(last):.2f}" for name, last in (("return", run.returns), ("length", run.lengths)) if last}
     run.bar.set_postfix({**shown, "SPS": f"{logs['charts/SPS']:.0f}"}, refresh=False)
     run.bar.update(batch_size)
 
@@ -1256,7 +1283,7 @@ CHUNK = 256  # images; the backward pass of 2,048 at once takes about 1.5 times 
 def in_chunks(forward: Callable, forward_rest: Callable) -> Callable:
     """Return a function that maps (B, ...) in chunks; the last one, if it is smaller, by forward_rest.
 
-    What is compiled for a CPU is so for one size: the rest would be compiled anew for every size that it has.
+    On a CPU the compiled function is for one size; the rest would be compiled again for every size that it has.
     """
 
     def chunked(x: Tensor) -> Tensor:
@@ -1360,12 +1387,12 @@ class GRUScan(torch.autograd.Function):
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the training as Ctrl-C does
     args = parse_args(sys.argv[1:])
     try:
         run = setup(args)
     except (ValueError, OSError, ImportError, gym.error.Error) as error:
         sys.exit(f"{Path(__file__).name}: {' '.join(str(error).split())}")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the training as Ctrl-C does
     try:
         run_to_end(args, run)
     except (MemoryLimit, FloatingPointError) as error:

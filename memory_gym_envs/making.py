@@ -52,17 +52,16 @@ def make_envs(
     observe_last_action: bool = False,
     spotlight_perturbation: bool = False,
     render_mode: str | None = None,
-    video_folder: str | None = None,
 ) -> VectorEnv:
     """Make a vector environment of N lanes with same-step autoreset; the caller's `reset(options=options)` begins.
 
     env_id: a Gymnasium id, or "module:id" if importing a module registers it.
     seed: of all lanes, which get streams of their own; the next reset needs none. options: see `parse_options`.
-    num_levels, start_level, obs_type: of Memory Gym environments; others have no such thing and ignore them.
+    num_levels, start_level, obs_type: of Memory Gym environments; others have no such thing and ignore them, with a
+        line on stderr where pictures are shown though vectors were asked for.
     frame_stack, step_encoding, observe_last_action, spotlight_perturbation: see GrayscaleStack and VectorStack,
         StepEncoding, LastAction, SpotlightPerturbation.
     render_mode: what render() draws; of other packages than this, always rgb_array.
-    video_folder: where to write videos of lane 0, see `LaneVideo`.
 
     Observations are dicts of pictures and vectors, see `ObservationParts`; actions are integers (N, A), see
     `branch_actions`; infos hold the statistics of ended episodes, see Gymnasium's vector RecordEpisodeStatistics.
@@ -71,9 +70,6 @@ def make_envs(
     that cannot be made or that is not supported, and for wrong arguments.
     """
     spec, memory_gym = find_spec(env_id), is_memory_gym(env_id)
-    if video_folder is not None:
-        check_can_film(spec)
-        render_mode = render_mode or "debug_rgb_array"
     levels = {"num_levels": num_levels, "start_level": start_level, "obs_type": obs_type}
     kwargs = levels if memory_gym else {}
     if render_mode is not None:
@@ -82,11 +78,13 @@ def make_envs(
         envs = same_step_envs(spec, num_envs, kwargs)
 
     envs = ObservationParts(branch_actions(envs))
+    pictures = [name for name, part in envs.single_observation_space.items() if len(part.shape) == 3]
+    if obs_type == "vector" and pictures and not memory_gym:
+        print(f"{env_id} has no vectors to show instead of its {', '.join(pictures)}", file=sys.stderr)
     if spotlight_perturbation:
         with one_line_errors("--spotlight-perturbation"):
             envs = SpotlightPerturbation(envs)
     if frame_stack:
-        pictures = any(len(part.shape) == 3 for part in envs.single_observation_space.values())
         with one_line_errors("--frame-stack"):
             envs = (GrayscaleStack if pictures else VectorStack)(envs, frame_stack)
     if step_encoding:
@@ -99,8 +97,7 @@ def make_envs(
             # Neighbouring seeds must not share lanes, so the lanes' seeds count up from a hash of the seed.
             envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]), options=options)
     # An explicit seed is a level of its own, which nobody plays: what counts episodes comes after it.
-    envs = RecordEpisodeStatistics(envs)
-    return envs if video_folder is None else LaneVideo(envs, video_folder)
+    return RecordEpisodeStatistics(envs)
 
 
 # ---- ids and options ----
@@ -232,11 +229,8 @@ class ObservationParts(VectorWrapper):
         """One step of every lane, its observations in parts, those in `final_obs` too."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         if "final_obs" in infos:
-            space, final, (ended,) = (
-                self.env.single_observation_space,
-                infos["final_obs"],
-                infos["_final_obs"].nonzero(),
-            )
+            space, final = self.env.single_observation_space, infos["final_obs"]
+            (ended,) = infos["_final_obs"].nonzero()
             last = self.parts(concatenate(space, final[ended], create_empty_array(space, len(ended))))
             for row, lane in enumerate(ended.tolist()):
                 final[lane] = {name: part[row] for name, part in last.items()}
@@ -356,6 +350,7 @@ def final_observations(
 class LaneVideo(RecordVideo):
     """Videos of lane 0: of the episodes that Gymnasium's capped cubic schedule picks (0, 1, 8, 27, ...).
 
+    env: has been reset; its present episode is number 0. folder: is made if it is not there.
     A video shows every observation that was acted on, up to the first 1,000. What is being recorded is written by
     close().
     """
@@ -365,6 +360,9 @@ class LaneVideo(RecordVideo):
             # That the observation after an episode's last action is missing, and that the folder is there already.
             warnings.simplefilter("ignore")
             super().__init__(env, folder, record_first_only=True)
+        self.episode_id = 0
+        self.start_recording(f"{self.name_prefix}-episode-0")
+        self._capture_frame()
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], Any, Any, Any, dict[str, Any]]:
         """One step of every lane; a video that is long enough ends here."""
@@ -383,8 +381,9 @@ class LaneVideo(RecordVideo):
         self.recorded_frames.append(picture)
 
 
-def check_can_film(spec: EnvSpec) -> None:
+def check_can_film(env_id: str) -> None:
     """Raise ImportError without the extra `play`, ValueError if the environment says that it draws no pictures."""
+    spec = find_spec(env_id)
     try:
         importlib.import_module("moviepy")
     except ImportError:

@@ -37,6 +37,7 @@ CASES = {
     "--exp-name ../up": "--exp-name is '../up'; it must be a name without slashes",
     "--env-id CueRecall-v0 --capture-video": "needs an environment that draws pictures .*; CueRecall-v0 draws none",
     "--target-kl nan": "--target-kl is nan; it must be above 0",
+    "--capture-video --load-model missing.pt": "there is no file missing.pt",
     "--load-model missing.pt": "there is no file missing.pt; --save-model writes model.pt",
 }
 
@@ -84,7 +85,12 @@ def test_the_command_prints_one_line_and_fails(line, tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-WRONG_FLAGS = {"--memory gur": "'gru'", "--num-envs many": "num-envs", "--no-such-flag 1": "no-such-flag"}
+WRONG_FLAGS = {
+    "--memory gur": "'gru'",
+    "--preset desktop": "laptop",
+    "--num-envs many": "num-envs",
+    "--no-such-flag 1": "no-such-flag",
+}
 
 
 @pytest.mark.parametrize("line", WRONG_FLAGS)
@@ -95,6 +101,19 @@ def test_wrong_flags(line, tmp_path):
     assert WRONG_FLAGS[line] in done.stderr
     assert "Traceback" not in done.stderr
     assert os.listdir(tmp_path) == []
+
+
+def test_infinity_is_no_limit(tiny):
+    ppo_gru.check_args(tiny(max_grad_norm=float("inf"), clip_coef=float("inf"), target_kl=float("inf")))
+
+
+def test_two_runs_do_not_share_a_folder(tiny, monkeypatch):
+    """Even when both have named it before either made it."""
+    ppo_gru.setup(tiny(env_id="CueRecall-v0"))
+    (folder,) = ppo_gru.Path("runs").iterdir()
+    monkeypatch.setattr(ppo_gru, "new_folder", lambda args: folder)
+    with pytest.raises(OSError, match="File exists"):
+        ppo_gru.setup(tiny(env_id="CueRecall-v0"))
 
 
 def test_as_many_minibatches_as_steps_without_memory(tiny):

@@ -357,11 +357,13 @@ def test_acting_and_learning_ask_no_device_for_numbers(played, monkeypatch, memo
     obs = {name: part[0] for name, part in rollout.obs.items()}
     with NoQuestions(), torch.no_grad():
         state = agent.memory.begin_rollout(state)
+        *_, state = agent.act(obs, state)
         agent.get_value(obs, state)
-    observations = script.UniqueObservations(rollout.obs, agent)
+    observations, optimizer = script.UniqueObservations(rollout.obs, agent), torch.optim.SGD(agent.parameters())
     for minibatch in pieces.minibatches(2):
         with NoQuestions():
             loss, _ = script.ppo_loss(agent, rollout, observations, minibatch, 1e-3, args)
             loss.backward()
             torch.nn.utils.clip_grad_norm_(agent.parameters(), 1.0)
+            optimizer.step()
     assert all(parameter.grad.device.type == "meta" for parameter in agent.parameters())

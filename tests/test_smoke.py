@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import threading
 import types
 
 import gymnasium as gym
@@ -264,10 +265,13 @@ def test_sigterm_keeps_what_was_learned(tmp_path):
     flags = "--env-id CartPole-v1 --hidden-size 8 --head-size 8 --num-envs 2 --num-steps 32 --num-minibatches 2"
     command = [sys.executable, ppo_gru.__file__, *flags.split(), "--no-cuda", "--save-model"]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        deadline = threading.Timer(200, process.kill)
+        deadline.start()
         while "SPS=" not in process.stderr.read(40):
             assert process.poll() is None
         process.terminate()
         said = process.stderr.read()
+        deadline.cancel()
     assert process.returncode == 0, said
     assert "Traceback" not in said
     (model,) = tmp_path.glob("runs/*/model.pt")

@@ -1,6 +1,5 @@
 """make_envs: every id, of this package and of others, is what a training script takes."""
 
-import os
 import subprocess
 import sys
 import zlib
@@ -17,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 
 import memory_gym_envs
 from memory_gym_envs import IDS, MortarMayhem, final_numbers, final_observations, making, parse_options
-from memory_gym_envs.making import as_vectors, is_memory_gym, make_envs
+from memory_gym_envs.making import LaneVideo, as_vectors, is_memory_gym, make_envs
 from memory_gym_envs.wrappers import gray
 
 LANES = 3
@@ -488,6 +487,14 @@ def test_memory_gym_draws_in_both_modes():
     assert [frame.shape for frame in envs.render()] == [(84, 84, 3)] * 2
 
 
+def filmed(env_id, num_envs, folder, options=None):
+    """Environments whose first episodes have begun and are being recorded."""
+    making.check_can_film(env_id)
+    envs = make_envs(env_id, num_envs, render_mode="debug_rgb_array")
+    envs.reset(seed=0, options=options)
+    return LaneVideo(envs, str(folder))
+
+
 def frames_of(folder):
     """The videos in the folder by name, and how many frames each has."""
     return {path.name: imageio_ffmpeg.count_frames_and_secs(str(path))[0] for path in Path(folder).glob("*.mp4")}
@@ -496,8 +503,7 @@ def frames_of(folder):
 def test_videos_are_of_whole_episodes_of_lane_0(tmp_path, recwarn, capfd, monkeypatch):
     drawn, annotate = [], MortarMayhem.annotate
     monkeypatch.setattr(MortarMayhem, "annotate", lambda *given: (drawn.append(given[2]), annotate(*given)))
-    envs = make_envs("MortarMayhemB-Grid-v0", LANES, seed=0, video_folder=str(tmp_path))
-    envs.reset()
+    envs = filmed("MortarMayhemB-Grid-v0", LANES, tmp_path)
     infos_of_ends = [step[-1] for step in roll(envs, 40) if (step[2] | step[3])[0]]
     lengths = [infos["episode"]["l"][0] for infos in infos_of_ends[:2]]
     envs.close()
@@ -511,8 +517,7 @@ def test_videos_are_of_whole_episodes_of_lane_0(tmp_path, recwarn, capfd, monkey
 def test_an_endless_episode_has_a_video_too(tmp_path, monkeypatch):
     monkeypatch.setattr(making, "MAX_VIDEO_FRAMES", 10)
     for steps, expected in ((5, 6), (25, 10)):
-        envs = make_envs("Endless-MortarMayhem-v0", 2, video_folder=str(tmp_path / str(steps)))
-        envs.reset(seed=0, options={"explosion_delay": [1000]})
+        envs = filmed("Endless-MortarMayhem-v0", 2, tmp_path / str(steps), {"explosion_delay": [1000]})
         list(roll(envs, steps))
         envs.close()
         assert frames_of(tmp_path / str(steps)) == {"rl-video-episode-0.mp4": expected}
@@ -520,8 +525,7 @@ def test_an_endless_episode_has_a_video_too(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("env_id", ["FrozenLake-v1", "minigrid:MiniGrid-MemoryS7-v0"])
 def test_videos_of_other_packages(env_id, tmp_path):
-    envs = make_envs(needs(env_id), 2, seed=0, video_folder=str(tmp_path))
-    envs.reset()
+    envs = filmed(needs(env_id), 2, tmp_path)
     list(roll(envs, 3))
     envs.close()
     assert sum(frames_of(tmp_path).values()) == 4
@@ -603,7 +607,6 @@ CASES = [
     (register(Broken), {}, "cannot be made: 'no such.*file'"),
     (register(Shows), {}, "cannot be made: .*space"),
     (register(Old, space=NUMBER), {"seed": 0}, "cannot be reset: .*unexpected keyword argument"),
-    ("CueRecall-v0", {"video_folder": "videos"}, "--capture-video needs .* draws pictures .*CueRecall-v0 draws none"),
 ]
 
 
@@ -612,7 +615,6 @@ def test_what_cannot_work_is_one_line(env_id, arguments, message):
     with pytest.raises((ValueError, ImportError, gym.error.Error), match=message) as error:
         make_envs(env_id, 2, **arguments)
     assert "\n" not in str(error.value)
-    assert not os.path.exists("videos")
 
 
 def test_other_autoreset_is_refused():
@@ -621,10 +623,19 @@ def test_other_autoreset_is_refused():
         make_envs("NextStep-v0", 2)
 
 
-def test_videos_need_the_extra(monkeypatch):
+def test_videos_need_the_extra_and_pictures(monkeypatch):
+    with pytest.raises(ValueError, match=r"--capture-video needs .* draws pictures .*CueRecall-v0 draws none"):
+        making.check_can_film("CueRecall-v0")
     monkeypatch.setitem(sys.modules, "moviepy", None)
     with pytest.raises(ImportError, match=r'--capture-video needs moviepy: pip install -e "\.\[play\]"'):
-        make_envs("MysteryPath-v0", 2, video_folder="videos")
+        making.check_can_film("MysteryPath-v0")
+
+
+def test_vectors_that_are_not_there_are_told(capfd):
+    make_envs("CartPole-v1", 1, obs_type="vector").close()
+    assert capfd.readouterr().err == "", "it shows vectors anyway"
+    make_envs(needs("ale_py:ALE/Pong-v5"), 1, obs_type="vector").close()
+    assert "ale_py:ALE/Pong-v5 has no vectors to show instead of its observation\n" in capfd.readouterr().err
 
 
 ALONE = """
