@@ -266,7 +266,7 @@ def test_all_but_pictures_become_gymnasiums_flat_vectors(space):
         (box(0, 1, (36, 36, 3), np.float64), (36, 36, 3), np.float32, lambda shown: shown.astype(np.float32)),
         (box(0, 1, (36, 36)), (36, 36, 1), np.float32, lambda shown: shown[..., None]),
     ],
-    ids=str,
+    ids=["gray", "colour", "channels first", "float64", "gray floats"],
 )
 def test_pictures_get_height_width_and_channels(space, shape, dtype, moved):
     envs = make_envs(shows(space), LANES, seed=0)
