@@ -7,7 +7,15 @@
 from gymnasium.envs.registration import register
 
 from memory_gym_envs.base import MemoryGymVectorEnv
-from memory_gym_envs.making import final_numbers, final_observations, is_memory_gym, make_envs, parse_options
+from memory_gym_envs.making import (
+    final_numbers,
+    final_observations,
+    is_memory_gym,
+    load_state,
+    make_envs,
+    parse_options,
+    save_state,
+)
 from memory_gym_envs.mortar_mayhem import MortarMayhem
 from memory_gym_envs.mystery_path import MysteryPath
 from memory_gym_envs.options import Option, options_table
@@ -25,9 +33,11 @@ __all__ = [
     "final_numbers",
     "final_observations",
     "is_memory_gym",
+    "load_state",
     "make_envs",
     "options_table",
     "parse_options",
+    "save_state",
 ]
 
 FAMILIES = (MortarMayhem, MysteryPath, SearingSpotlights)

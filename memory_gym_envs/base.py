@@ -20,6 +20,7 @@ from gymnasium.vector.utils import batch_space
 from memory_gym_envs.drawing import magnify
 from memory_gym_envs.entries import vector_space
 from memory_gym_envs.options import brief, resolve
+from memory_gym_envs.saving import Saved, plain, restored
 
 RENDER_MODES = ("rgb_array", "debug_rgb_array")
 OBS_TYPES = ("pixels", "vector")
@@ -29,7 +30,7 @@ NO_LIMIT = np.iinfo(np.int64).max  # of steps
 LEVEL_STREAM = 1  # keeps the generator that chooses levels apart from the one that builds them
 
 
-class MemoryGymVectorEnv(VectorEnv):
+class MemoryGymVectorEnv(Saved, VectorEnv):
     """N environments of one id, stepped together.
 
     Arguments:
@@ -58,6 +59,7 @@ class MemoryGymVectorEnv(VectorEnv):
     }
     variants: ClassVar[Mapping[str, Any]] = {}
     tables: ClassVar[tuple[str, ...]] = ("_wardrobe",)  # attributes that place_tables() makes, too large to pickle
+    kept = ("ready", "settings", "_rngs", "_level_rngs", "_seeds")  # besides the arrays of `state`
 
     def __init__(
         self,
@@ -219,6 +221,29 @@ class MemoryGymVectorEnv(VectorEnv):
 
     def __setstate__(self, values: dict[str, Any]) -> None:
         self.__dict__.update(values)
+        self.place_tables()
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What it was made with; a saved state fits no other."""
+        names = ("num_envs", "num_levels", "start_level", "obs_type")
+        return {"id": self.variant_id, **{name: getattr(self, name) for name in names}}
+
+    def get_state(self) -> dict[str, Any]:
+        """The lanes' arrays, options, seeds and generators, in plain values that later steps do not change."""
+        return {**super().get_state(), "arrays": plain(vars(self.state))}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Takes over a copy of what get_state() of an environment with the same arguments returned.
+
+        Raises ValueError for the state of another version of the environment; nothing has changed then.
+        """
+        arrays, settings = restored(state["arrays"]), [self.resolve(each) for each in state["settings"]]
+        if arrays.keys() != vars(self.state).keys():
+            raise ValueError(f"the saved state is of another version of {self.variant_id}")
+        super().set_state({**state, "settings": settings})
+        self.configure(np.arange(self.num_envs))  # for what follows from the options of all lanes
+        self.state = type(self.state)(**arrays)
         self.place_tables()
 
     def resolve(self, options: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Making any Gymnasium id ready to train on, for scripts that do not ask what the environment is.
 
-`make_envs` is a table of contents of vector wrappers. What a training script counts and logs is read from infos:
+`make_envs` is a table of contents of vector wrappers; `save_state` and `load_state` copy the state of all of them.
+What a training script counts and logs is read from infos:
 `final_numbers` and `final_observations` take from them what belongs to the episodes that just ended.
 Shape letters: N lanes, A action branches, H, W and C of a picture, V of a vector.
 """
@@ -9,6 +10,7 @@ import contextlib
 import importlib
 import json
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -23,6 +25,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics, RecordVideo, Tran
 
 from memory_gym_envs.base import MemoryGymVectorEnv
 from memory_gym_envs.options import brief
+from memory_gym_envs.saving import Saved
 from memory_gym_envs.wrappers import (
     GrayscaleStack,
     LastAction,
@@ -97,7 +100,74 @@ def make_envs(
             # Neighbouring seeds must not share lanes, so the lanes' seeds count up from a hash of the seed.
             envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]), options=options)
     # An explicit seed is a level of its own, which nobody plays: what counts episodes comes after it.
-    return RecordEpisodeStatistics(envs)
+    return EpisodeStatistics(envs)
+
+
+# ---- saved states ----
+
+
+def save_state(envs: VectorEnv) -> dict[str, Any] | None:
+    """Return the whole state of environments from `make_envs`, or None if there are parts of other packages in them.
+
+    They may be in a `LaneVideo`, whose state is the number of the episode.
+    Saved are: every array of the environment, with the levels that are being played; each lane's generator and its
+    seed, and the one that chooses levels; the present options, which automatic resets keep; frame stacks, step numbers
+    and last actions; the lights of the perturbation and their generators; returns and lengths of the episodes so far,
+    and of the last ended ones. Not saved are an episode's seconds, which count from `load_state`, and a video that is
+    being recorded: the next scheduled episode has one again.
+
+    All values are plain: dicts with str keys, lists, tuples, str, int, float, bool, None, and NumPy arrays of numbers
+    or bools. They are copies: later steps do not change them.
+    """
+    parts = saved_parts(envs)
+    if parts is None:
+        return None
+    return {"environments": describe(parts), "parts": [part.get_state() for part in parts]}
+
+
+def load_state(envs: VectorEnv, state: dict[str, Any]) -> None:
+    """Set environments, made with the same arguments, to what `save_state` returned: they play on exactly from there.
+
+    No reset is needed before or after. The state remains the caller's: later steps do not change it.
+
+    Raises ValueError if the state is of other environments: of another id, number of lanes, choice of levels or kind of
+    observation, or with other wrappers. Nothing has changed then.
+    """
+    parts = saved_parts(envs)
+    if parts is None:
+        raise ValueError(f"{envs.spec.id} has parts of other packages, whose state cannot be set")
+    ours, theirs = describe(parts), state["environments"]
+    for name in ours | theirs:
+        if ours.get(name) != theirs.get(name):
+            raise ValueError(
+                f"the saved state is of environments with {name} {theirs.get(name)!r}, not {ours.get(name)!r}"
+            )
+    for part, each in zip(parts, state["parts"], strict=True):
+        part.set_state(each)
+
+
+def saved_parts(envs: VectorEnv) -> list[Saved] | None:
+    """The environment and its wrappers that have a state, from the inside out; None if one's is not known."""
+    parts: list[Saved] = []
+    layers = [envs]
+    while isinstance(layers[-1], VectorWrapper):
+        layers.append(layers[-1].env)
+    for layer in reversed(layers):
+        if isinstance(layer, Saved):
+            parts.append(layer)
+        elif not isinstance(layer, (ObservationParts, TransformAction)):  # which have none
+            return None
+    return parts
+
+
+def describe(parts: list[Saved]) -> dict[str, Any]:
+    """What environments with these parts were made with: a state of one fits the other if this is equal."""
+    environment, *wrappers = parts
+    names = [type(wrapper).__name__ for wrapper in wrappers]
+    values = {**environment.arguments, "wrappers": ", ".join(names)}
+    for name, wrapper in zip(names, wrappers, strict=True):
+        values |= {f"{name}'s {argument}": value for argument, value in wrapper.arguments.items()}
+    return values
 
 
 # ---- ids and options ----
@@ -344,16 +414,37 @@ def final_observations(
     return observations
 
 
+class EpisodeStatistics(Saved, RecordEpisodeStatistics):
+    """Gymnasium's statistics of ended episodes, which can be saved, but for the seconds: those start again."""
+
+    kept = ("episode_count", "episode_returns", "episode_lengths", "prev_dones")
+    queues = ("return_queue", "length_queue")
+
+    def get_state(self) -> dict[str, Any]:
+        """Returns and lengths so far, and those of the last ended episodes."""
+        return {**super().get_state(), **{name: np.array(getattr(self, name)) for name in self.queues}}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Takes over a copy of what get_state() returned."""
+        super().set_state(state)
+        for name in self.queues:
+            getattr(self, name).clear()
+            getattr(self, name).extend(state[name])
+        self.episode_start_times = np.full(self.num_envs, time.perf_counter())
+
+
 # ---- videos ----
 
 
-class LaneVideo(RecordVideo):
+class LaneVideo(Saved, RecordVideo):
     """Videos of lane 0: of the episodes that Gymnasium's capped cubic schedule picks (0, 1, 8, 27, ...).
 
     env: has been reset; its present episode is number 0. folder: is made if it is not there.
     A video shows every observation that was acted on, up to the first 1,000. What is being recorded is written by
-    close().
+    close(). Its state is the number of the episode alone.
     """
+
+    kept = ("episode_id", "step_id")
 
     def __init__(self, env: VectorEnv, folder: str):
         with warnings.catch_warnings():
@@ -363,6 +454,11 @@ class LaneVideo(RecordVideo):
         self.episode_id = 0
         self.start_recording(f"{self.name_prefix}-episode-0")
         self._capture_frame()
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Takes over the number of the episode, of which the beginning is missing: it has no video."""
+        super().set_state(state)
+        self.recording, self.recorded_frames = False, []
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], Any, Any, Any, dict[str, Any]]:
         """One step of every lane; a video that is long enough ends here."""

@@ -493,6 +493,7 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     variants = VARIANTS
     tables = (*MemoryGymVectorEnv.tables, "_looks")
+    kept = (*MemoryGymVectorEnv.kept, "_clues_open")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
         """The observation space of one lane with pixels, and its action space."""

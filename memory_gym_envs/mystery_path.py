@@ -160,7 +160,7 @@ class State:
     trail_y: np.ndarray  # (m,)
     hurt: np.ndarray  # (N,) bool: in the pit, and a cross shows it
     known: np.ndarray  # (N, M) bool: the agent fell off there before
-    walls: np.ndarray  # (N,) object: the untraceable places of each segment, a list of lists
+    walls: np.ndarray  # (N, M) bool: the path may not lead there; nothing but the debug view needs it
     segments: np.ndarray  # (N,)
     furthest: np.ndarray  # (N,) the rightmost column of the path reached so far
     stamina: np.ndarray  # (N,) steps left to reach another tile
@@ -196,11 +196,11 @@ def empty_state(lanes: int, segments: int) -> State:
     """The state of N lanes before their first reset, with room for this many segments."""
     steps, cells = (SIDE * SIDE + 1,), (segments * SEGMENT * ROWS,)
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("pos", "origin", "tile"), (2,))
-    shapes |= {"speed": (1,), "step_at": cells, "known": cells}
+    shapes |= {"speed": (1,), "step_at": cells, "known": cells, "walls": cells}
     shapes |= dict.fromkeys(("cell", "heading_at", "reached"), steps)
-    flags = ("fallen", "past", "hurt", "cross_fits", "known", "extras", "feedback")
+    flags = ("fallen", "past", "hurt", "cross_fits", "known", "walls", "extras", "feedback")
     kinds: dict[str, Any] = dict.fromkeys((*flags, *(f"show_{what}" for what in SHOWN)), bool)
-    kinds |= dict.fromkeys(("returned", "camera"), np.float64) | {"walls": object}
+    kinds |= dict.fromkeys(("returned", "camera"), np.float64)
     kinds |= dict.fromkeys(("reward_goal", "reward_fall_off", "reward_progress", "reward_step"), np.float64)
     names = State.__dataclass_fields__
     s = State(**{name: np.zeros((lanes, *shapes.get(name, ())), kinds.get(name, np.int64)) for name in names})
@@ -227,7 +227,7 @@ def make_room(s: State, steps: int, segments: int) -> bool:
     steps, segments = max(steps + 1, s.cell.shape[1] * 3 // 2), max(segments, room * 3 // 2)
     for name in ("cell", "heading_at", "reached"):
         setattr(s, name, widened(getattr(s, name), steps))
-    for name in ("step_at", "known"):
+    for name in ("step_at", "known", "walls"):
         setattr(s, name, widened(getattr(s, name), segments * SEGMENT * ROWS))
     return True
 
@@ -374,10 +374,9 @@ def cells_of(places: list[int], segment: int) -> list[int]:
 def write_level(s: State, lane: int, level: Level, endless: bool) -> None:
     """Starts the lane's episode at this level."""
     s.step_at[lane] = PIT
-    s.known[lane] = s.fallen[lane] = s.hurt[lane] = False
+    s.known[lane] = s.walls[lane] = s.fallen[lane] = s.hurt[lane] = False
     s.count[lane] = s.segments[lane] = s.furthest[lane] = s.fails[lane] = s.visited[lane] = 0
     s.length[lane] = s.returned[lane] = 0
-    s.walls[lane] = []
     write_path(s, lane, level, endless)
     s.reached[lane] = 0
     s.reached[lane, PIT] = s.reached[lane, 1] = REACHED
@@ -406,8 +405,9 @@ def write_path(s: State, lane: int, level: Level, endless: bool) -> None:
     # Behind a transition tile the path goes on to the right. The goal has the direction that leads to it.
     s.heading_at[lane, last - 1] = EAST if endless else s.heading_at[lane, last - 2]
     s.count[lane] = last - 1
+    for segment, walls in enumerate(level.walls, int(s.segments[lane])):
+        s.walls[lane, cells_of(walls, segment)] = True
     s.segments[lane] += len(level.walls)
-    s.walls[lane] += level.walls
 
 
 def forget_trails(s: State, lanes: np.ndarray) -> None:
@@ -975,8 +975,7 @@ class MysteryPath(MemoryGymVectorEnv):
         marks[0] = (marks[0][0], ORIGIN)
         if not endless:
             marks[-1] = (marks[-1][0], GOAL)
-        for segment, walls in enumerate(s.walls[lane]):
-            marks += [(cell, WALL) for cell in cells_of(walls, segment)]
+        marks += [(cell, WALL) for cell in np.flatnonzero(s.walls[lane]).tolist()]
         camera = int(s.pos[lane, 0] - s.origin[lane, 0] - s.camera[lane]) if endless else 0
         for cell, kind in marks:
             centre = tile_centres(np.array([cell])) - (camera, 0)

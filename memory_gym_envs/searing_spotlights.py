@@ -1026,6 +1026,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
 
     variants = VARIANTS
     tables = ("_wardrobe", "_art", "_gauges")
+    kept = (*MemoryGymVectorEnv.kept, "_unlocked")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
         """The observation space of one lane with pixels, and its action space."""

@@ -18,6 +18,7 @@ from memory_gym_envs.base import ALL, one_of, overwrite
 from memory_gym_envs.bits import pixels
 from memory_gym_envs.drawing import FRAME, SCREEN
 from memory_gym_envs.options import brief, resolve
+from memory_gym_envs.saving import Saved
 from memory_gym_envs.searing_spotlights import (
     SPEED,
     TIME,
@@ -40,7 +41,7 @@ LIGHTS = tuple(row for row in VARIANTS["SearingSpotlights-v0"].options if row.na
 UNPLAYED = {"num_coins": [], "use_exit": False, "spot_damage": 0.0, "max_steps": -1}
 
 
-class SameStepWrapper(VectorWrapper):
+class SameStepWrapper(Saved, VectorWrapper):
     """What the wrappers share: an episode ends and the next one begins, however the environment resets.
 
     The observation of a lane whose episode just ended is the wrapped first one of its next episode; `final_obs` holds
@@ -153,10 +154,12 @@ class GrayscaleStack(PictureWrapper):
     """
 
     channels = (1, 3)
+    kept = ("_stack",)
 
     def __init__(self, env: VectorEnv, frames: int = 4):
         super().__init__(env)
         shape = (*self.picture_shape[:2], stack_size(frames))
+        self.arguments = {"frames": shape[-1]}
         self._stack = np.zeros((self.num_envs, *shape), np.uint8)
         space = self.replaced(env.single_observation_space, gym.spaces.Box(0, 255, shape, np.uint8))
         self._set_space(gym.spaces.Dict(space) if isinstance(space, dict) else space)
@@ -188,9 +191,12 @@ class VectorStack(SameStepWrapper):
     K below 1.
     """
 
+    kept = ("_stacks",)
+
     def __init__(self, env: VectorEnv, frames: int = 4):
         super().__init__(env)
         space, frames = env.single_observation_space, stack_size(frames)
+        self.arguments = {"frames": frames}
         parts = named(space)
         if not all(isinstance(part, gym.spaces.Box) and len(part.shape) == 1 for part in parts.values()):
             raise ValueError(f"VectorStack needs a vector to observe, or a Dict of vectors, not {space}")
@@ -231,11 +237,14 @@ class StepEncoding(SameStepWrapper):
     or one below 2.
     """
 
+    kept = ("_steps",)
+
     def __init__(self, env: VectorEnv, width: int = 16):
         super().__init__(env)
         if not isinstance(width, (int, np.integer)) or width < 2 or width % 2:
             raise ValueError(f"width must be an even integer of at least 2, not {width!r}")
         self.width, self._steps = int(width), np.zeros(self.num_envs, np.int64)
+        self.arguments = {"width": self.width}
         self._add_part(STEP_ENCODING, gym.spaces.Box(-1.0, 1.0, (self.width,), np.float32))
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
@@ -260,6 +269,8 @@ class LastAction(SameStepWrapper):
 
     Raises ValueError for an environment without same-step autoreset, with other actions or with a part of that name.
     """
+
+    kept = ("_last",)
 
     def __init__(self, env: VectorEnv):
         super().__init__(env)
@@ -311,10 +322,19 @@ class SpotlightPerturbation(PictureWrapper):
                 raise ValueError(f"{name} must be an integer from 0 to 255, not {value!r}")
         self.clear, self.veil = np.uint16(255 - opacity), np.uint16(shade * opacity)
         values = resolve(LIGHTS, lights, type(self).__name__)
+        self.arguments = {"opacity": int(opacity), "shade": int(shade), **values}
         self._light = SearingSpotlights("SearingSpotlights-v0", self.num_envs)
         self._settings = self._light.resolve({**values, **UNPLAYED})
         least, largest = values["spot_min_radius"], values["spot_max_radius"]
         self._radii = int(least), int(max(least, largest))
+
+    def get_state(self) -> dict[str, Any]:
+        """The state of the light in plain values: its spotlights, and the lanes' generators for them."""
+        return self._light.get_state()
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Takes over a copy of what get_state() returned."""
+        self._light.set_state(state)
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
         """Draws the first spotlights of the lanes' episodes."""

@@ -62,7 +62,8 @@ def test_paths_lead_to_the_opposite_side(env_id, side):
         assert (path[0][axis], path[-1][axis]) == (near, SIDE - 1 - near)
         assert all(0 <= x < SIDE and 0 <= y < SIDE for x, y in path)
         check_path(s, path)
-        assert not any(x * SIDE + y in s.walls[0][0] for x, y in path)
+        assert s.walls[0].any()
+        assert not s.walls[0, s.cell[0, 1 : len(path) + 1]].any()
         ends.add((path[0], path[-1]))
         lengths.add(len(path))
     assert len(ends) > 20
@@ -383,9 +384,7 @@ def test_debug_render_shows_the_path(env_id):
         path = path_of(s)
         kinds = {place: BLUE if place[0] % SEGMENT == SIDE else WHITE for place in path}
         kinds |= {path[0]: BLUE} | ({} if endless else {path[-1]: GREEN})
-        for segment, walls in enumerate(s.walls[0]):
-            places = [divmod(place, SIDE) for place in walls]
-            kinds |= {(column + SEGMENT * segment, row): RED for column, row in places}
+        kinds |= {(cell // ROWS, cell % ROWS - BEYOND): RED for cell in np.flatnonzero(s.walls[0]).tolist()}
         shown = 0
         for (column, row), color in kinds.items():
             x, y = 4 * (column * TILE - offset), 4 * row * TILE
