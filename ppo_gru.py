@@ -216,18 +216,8 @@ PRESETS = {
     },
 }
 # What shapes the network; an error message names these if weights do not fit.
-NETWORK_FLAGS = (
-    "env_id",
-    "obs_type",
-    "frame_stack",
-    "step_encoding",
-    "observe_last_action",
-    "vector_frequencies",
-    "head_size",
-    "memory",
-    "hidden_size",
-    "num_layers",
-)
+OBSERVATION_FLAGS = ("env_id", "obs_type", "frame_stack", "step_encoding", "observe_last_action", "vector_frequencies")
+NETWORK_FLAGS = (*OBSERVATION_FLAGS, "head_size", "memory", "hidden_size", "num_layers")
 
 
 def longest_piece(args: Args) -> int:

@@ -235,14 +235,8 @@ PRESETS = {
     },
 }
 # What shapes the network; an error message names these if weights do not fit.
-NETWORK_FLAGS = (
-    "env_id",
-    "obs_type",
-    "frame_stack",
-    "step_encoding",
-    "observe_last_action",
-    "vector_frequencies",
-    "head_size",
+OBSERVATION_FLAGS = ("env_id", "obs_type", "frame_stack", "step_encoding", "observe_last_action", "vector_frequencies")
+BLOCK_FLAGS = (
     "trxl_num_layers",
     "trxl_num_heads",
     "trxl_dim",
@@ -250,6 +244,7 @@ NETWORK_FLAGS = (
     "trxl_pe_length",
     "trxl_gate",
 )
+NETWORK_FLAGS = (*OBSERVATION_FLAGS, "head_size", *BLOCK_FLAGS)
 
 
 def longest_piece(args: Args) -> int:
