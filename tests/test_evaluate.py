@@ -292,7 +292,7 @@ BAD = {
     "MODEL --levels 0": "--levels is 0; it must be 1 or more",
     "MODEL --max-steps 0": "--max-steps is 0",
     "MODEL --json no/where.json": "there is no folder no to write to",
-    "MODEL --metrics coins": "not every episode told coins; they told return, length, finished",
+    "MODEL --metrics coins": "not every episode told coins; they told return, length, reward",
     "--curves nowhere": "there is no run folder nowhere",
     "--curves empty": "empty holds no curves",
     "--curves RUN --metrics coins": "no curve of coins in common; they all have .*eval/success",

@@ -36,5 +36,7 @@ def test_transformer_memory(tiny, scalars, encoding, gate):
 @pytest.mark.slow
 @pytest.mark.parametrize("faster", ["amp", "compile"])
 def test_with_bfloat16_or_compiled(tiny, scalars, faster):
+    # Rounding differs from processor to processor, and with it when the task is solved: 40 iterations instead of 30.
+    longer = {**SETTINGS, "total_timesteps": STEPS * 4 // 3, "anneal_steps": STEPS * 4 // 3}
     for script, memory in ((ppo_gru, {"hidden_size": 64}), (ppo_trxl, WINDOW)):
-        assert final_return(scalars, script, tiny(script, **{faster: True}, **memory, **SETTINGS)) >= 0.95
+        assert final_return(scalars, script, tiny(script, **{faster: True}, **memory, **longer)) >= 0.95
