@@ -23,25 +23,30 @@ ground truth, V entries of a vector.
 
 import argparse
 import contextlib
+import io
 import itertools
 import math
 import os
+import random
 import signal
 import sys
+import threading
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
 
 import gymnasium as gym
 import numpy as np
 import torch
+import torch.distributed as dist
 import torch.nn.functional as F
 import tyro
 from torch import Tensor, nn
 from torch.distributions import Categorical
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torch.nn.utils.rnn import pad_sequence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -51,8 +56,10 @@ from memory_gym_envs.making import (
     check_can_film,
     final_numbers,
     final_observations,
+    load_state,
     make_envs,
     parse_options,
+    save_state,
 )
 
 
@@ -106,6 +113,13 @@ class Args:
     """write weights and arguments to model.pt in the run folder when training ends"""
     load_model: str | None = None
     """start from the weights in this file, written by --save-model"""
+    resume: str | None = None
+    """go on with the run in this folder from its last checkpoint; no other flag is needed, and no other value allowed,
+    but for a larger --total-timesteps"""
+    checkpoint_interval: NonNegativeInt = 50
+    """iterations from one checkpoint to the next, and one when training ends or is stopped; two are kept (0: none)"""
+    keep_models: NonNegativeInt = 0
+    """keep the weights of so many points of the training, evenly spaced, as model-STEP.pt"""
 
     env_id: str = "MortarMayhem-Grid-v0"
     """any Gymnasium id with Discrete or MultiDiscrete actions, with its module if that has to be imported first, e.g.
@@ -158,9 +172,9 @@ class Args:
     """the gradient is scaled down to this norm"""
     target_kl: PositiveFloat | None = None
     """end an iteration's update after the epoch whose mean KL divergence exceeds this"""
-    init_lr: NonNegativeFloat = 2.75e-4
+    init_lr: UnitInterval = 2.75e-4
     """learning rate at the first step"""
-    final_lr: NonNegativeFloat = 1.0e-5
+    final_lr: UnitInterval = 1.0e-5
     """learning rate from step --anneal-steps on"""
     init_ent_coef: NonNegativeFloat = 1.0e-4
     """weight of the entropy bonus at the first step"""
@@ -517,6 +531,8 @@ class Memory(nn.Module):
     for the LSTM, none without memory.
     """
 
+    overwritten = ("stored",)  # by every rollout before it is read: a checkpoint leaves it out
+
     def __init__(self, args: Args):
         super().__init__()
         self.kind, self.seq_len, self.width = args.memory, args.seq_len, args.hidden_size
@@ -800,7 +816,10 @@ def auxiliary_losses(
 def update(
     agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, ent_coef: float, args: Args
 ) -> dict[str, float]:
-    """Learn from the rollout for some epochs; return what to log, averaged over the minibatches."""
+    """Learn from the rollout for some epochs; return what to log, averaged over the minibatches.
+
+    Raises FloatingPointError before a step that would spoil the weights.
+    """
     observations = UniqueObservations(rollout.obs, agent)
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
     # A detached estimator is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
@@ -813,12 +832,17 @@ def update(
             loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
             optimizer.zero_grad()
             loss.backward()
+            average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
             log["grad_norm"] = nn.utils.clip_grad_norm_(parameters, args.max_grad_norm)
-            nn.utils.clip_grad_norm_(probe, args.max_grad_norm)
+            probe_norm = nn.utils.clip_grad_norm_(probe, args.max_grad_norm)
+            if not (log["loss"] + log["grad_norm"] + probe_norm).isfinite():
+                raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
             optimizer.step()
             logs.append(log)
-        if args.target_kl is not None and mean_log(logs[-args.num_minibatches :])["approx_kl"] > args.target_kl:
-            break
+        if args.target_kl is not None:
+            kl = mean_log(logs[-args.num_minibatches :])["approx_kl"]
+            if np.mean(all_gather(kl)) > args.target_kl:  # section 8: all processes stop, or none
+                break
 
     losses = mean_log(logs)
     # Before the first gradient step the weights are those that acted, and so must be every probability.
@@ -836,18 +860,19 @@ def mean_log(logs: list[dict[str, Tensor]]) -> dict[str, float]:
 
 
 def train(args: Args, run: "Run") -> None:
-    """Train for --total-timesteps, rounded down to whole iterations.
+    """Train until --total-timesteps, rounded down to whole iterations, or until a signal.
 
-    Raises FloatingPointError if the training diverges, MemoryLimit as the memory does.
+    Raises FloatingPointError if the training diverges, MemoryLimit as the memory does, OSError as `report` does.
     """
     agent, rollout, batch_size = run.agent, run.rollout, args.num_envs * args.num_steps
-    for step in range(0, args.total_timesteps - batch_size + 1, batch_size):
-        began = time.perf_counter()
+    for step in range(run.step, args.total_timesteps - batch_size + 1, batch_size):
+        began, run.iteration = time.perf_counter(), step // batch_size + 1
         lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
         ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
         run.optimizer.param_groups[0]["lr"].fill_(lr)
 
         last_value, episodes = collect(agent, run.envs, rollout, args)
+        collected = time.perf_counter()
         rollout.advantages = gae(
             rewards=rollout.rewards,
             values=rollout.values,
@@ -860,12 +885,15 @@ def train(args: Args, run: "Run") -> None:
         )
         rollout.returns = rollout.advantages + rollout.values
         logs = update(agent, run.optimizer, rollout, ent_coef, args)
+        updated = time.perf_counter()
 
-        if not math.isfinite(logs["losses/grad_norm"]):
-            raise FloatingPointError("the training diverged: its gradient is not finite; try a lower --init-lr")
-        run.seconds += time.perf_counter() - began
         logs |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
-        report(args, run, step + batch_size, logs, episodes)  # section 8: evaluation, TensorBoard, progress bar
+        seconds = {"collect": collected - began, "update": updated - collected, "iteration": updated - began}
+        logs |= {f"charts/seconds_{part}": value for part, value in seconds.items()}
+        run.step = step + batch_size
+        report(args, run, logs, episodes)  # section 8: evaluation, TensorBoard, progress bar, checkpoints
+        if run.stop:
+            break
 
 
 # ---- 7 EVALUATION ----
@@ -936,11 +964,15 @@ class Run:
     optimizer: torch.optim.Optimizer
     rollout: Rollout
     folder: Path
-    writer: SummaryWriter
-    bar: tqdm
+    writer: SummaryWriter | None = None  # as the progress bar, the first process's alone
+    bar: tqdm | None = None
+    iteration: int = 0  # the present one, from 1
+    step: int = 0  # so far, of all environments together
     seconds: float = 0.0  # of training, without evaluations
     returns: deque = field(default_factory=lambda: deque(maxlen=100))  # of the last episodes, for the progress bar
     lengths: deque = field(default_factory=lambda: deque(maxlen=100))
+    signal: int = 0  # SIGTERM or SIGINT, if this process got one
+    stop: bool = False  # whether training ends after this iteration, since any process got one
 
 
 def flag(name: str) -> str:
@@ -949,13 +981,20 @@ def flag(name: str) -> str:
 
 
 def parse_args(argv: list[str]) -> Args:
-    """Parse a command line; its flags win over what --preset holds."""
+    """Parse a command line; its flags win over what --preset holds, or what the run of --resume began with.
+
+    Raises what `read_checkpoint` raises.
+    """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset")
-    held = PRESETS.get(first.parse_known_args(argv)[0].preset, {})  # an unknown one is told by tyro, as all errors are
+    first.add_argument("--resume")
+    given = first.parse_known_args(argv)[0]
+    default = Args(**PRESETS.get(given.preset, {}))  # an unknown one is told by tyro, as all errors are
+    if given.resume is not None:
+        default = saved_args(read_checkpoint(given.resume))
     laptop = " ".join(f"{flag(name)} {value}" for name, value in PRESETS["laptop"].items())
     description = f"{Args.__doc__} The defaults are the thesis'. --preset laptop stands for {laptop}"
-    return tyro.cli(Args, args=argv, default=Args(**held), description=description)
+    return tyro.cli(Args, args=argv, default=default, description=description)
 
 
 def check_args(args: Args) -> None:
@@ -975,11 +1014,14 @@ def check_args(args: Args) -> None:
             f"--total-timesteps is {args.total_timesteps}, less than one iteration of {batch_size} steps "
             f"(--num-envs {args.num_envs} x --num-steps {args.num_steps})"
         )
-    longest = longest_piece(args)
-    if args.num_minibatches * longest > batch_size:
+    _, processes = rank_and_size()
+    if args.num_envs % processes:
+        raise ValueError(f"--num-envs is {args.num_envs}; it must be a multiple of the {processes} processes")
+    longest, share = longest_piece(args), batch_size // processes
+    if args.num_minibatches * longest > share:
         raise ValueError(
-            f"--num-minibatches is {args.num_minibatches}, but an iteration may have only {batch_size // longest} "
-            f"pieces (up to {longest} of {batch_size} steps each); use that many or shorter pieces"
+            f"--num-minibatches is {args.num_minibatches}, but an iteration may have only {share // longest} "
+            f"pieces (up to {longest} of {share} steps each); use that many or shorter pieces"
         )
 
 
@@ -1005,41 +1047,64 @@ def make_agent(envs: gym.vector.VectorEnv, infos: dict, args: Args, device: torc
 def setup(args: Args) -> Run:
     """Check the arguments and make everything, the run folder last: bad input raises before anything is written.
 
+    Under torchrun, each process makes its share of the environments, and the first one what writes and evaluates.
     Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
     """
+    if dist.is_torchelastic_launched() and not dist.is_initialized():
+        dist.init_process_group()
+    rank, processes = rank_and_size()
     check_args(args)
+    checkpoint = None if args.resume is None else read_checkpoint(args.resume)
+    if checkpoint is not None:
+        check_resumed(args, checkpoint)
+    step = 0 if checkpoint is None else checkpoint["step"]
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
-    device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
-    if device.type == "cuda":
+    device = torch.device("cpu")
+    if torch.cuda.is_available() and args.cuda:
+        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
         torch.set_float32_matmul_precision("high")  # TF32
     options = parse_options(args.env_id, args.env_options)
     if args.capture_video:
         check_can_film(args.env_id)
     with enough_memory(args, device):
         mode = "debug_rgb_array" if args.capture_video else None
-        envs = environments(args, args.num_envs, seed=args.seed, options=options, render_mode=mode)
+        share = args.num_envs // processes
+        # Where a checkpoint cannot set the environments, they must not begin with the same levels again.
+        seed = [args.seed, step] if step else args.seed
+        envs = environments(args, share, seed=seed, first_lane=rank * share, options=options, render_mode=mode)
         obs, infos = envs.reset(options=options)
         agent = make_agent(envs, infos, args, device)
         rollout = Rollout.allocate(
             args.num_steps, obs, infos["ground_truth"] if args.ground_truth_coef else None, agent
         )
-        eval_envs = environments(args, len(evaluation_levels(args))) if args.eval_interval else None
-    if args.load_model is not None:
+        evaluates = args.eval_interval and rank == 0
+        eval_envs = environments(args, len(evaluation_levels(args))) if evaluates else None
+    if rank > 0:  # the weights are those of every process, the actions are not
+        torch.manual_seed(int(np.random.SeedSequence([args.seed, rank]).generate_state(1)[0]))
+    if args.load_model is not None and checkpoint is None:
         load_weights(agent, read_model(args.load_model), args.load_model)
     speed_up(agent, args, rollout.next_obs)
     # As a tensor, the learning rate is set in place; the weight decay is torch's default.
     optimizer = torch.optim.AdamW(agent.parameters(), lr=torch.tensor(args.init_lr), weight_decay=0.01, fused=True)
 
-    folder = new_folder(args)
-    if args.track:
-        start_tracking(args, folder.name)
-    writer = open_writer(args, folder)
-    if args.capture_video:
-        envs = LaneVideo(envs, str(folder / "videos"))
-    batch_size = args.num_envs * args.num_steps
-    bar = tqdm(total=args.total_timesteps // batch_size * batch_size, unit=" steps", unit_scale=True)
-    return Run(envs, eval_envs, agent, optimizer, rollout, folder, writer, bar)
+    folder = Path(args.resume or all_gather(new_folder(args))[0])
+    if rank == 0:
+        if args.track:
+            start_tracking(args, folder.name)
+        if args.resume is None:
+            make_folder(folder)
+        if args.capture_video:
+            envs = LaneVideo(envs, str(folder / "videos"))
+    run = Run(envs, eval_envs, agent, optimizer, rollout, folder)
+    if checkpoint is not None:
+        load_checkpoint(run, checkpoint)
+    if rank == 0:
+        run.writer = open_writer(args, run)
+        batch_size = args.num_envs * args.num_steps
+        whole = args.total_timesteps // batch_size * batch_size
+        run.bar = tqdm(total=whole, initial=step, unit=" steps", unit_scale=True)
+    return run
 
 
 @contextlib.contextmanager
@@ -1065,18 +1130,19 @@ def new_folder(args: Args) -> Path:
     return next(folder for folder in itertools.chain([first], numbered) if not folder.exists())
 
 
-def open_writer(args: Args, folder: Path) -> SummaryWriter:
-    """Make the run folder and its TensorBoard file, which begins with the hyperparameters.
-
-    Raises OSError if the folder cannot be made.
-    """
+def make_folder(folder: Path) -> None:
+    """Make a run folder; raise OSError if that cannot be done, or if another run has made it."""
     try:
         folder.mkdir(parents=True)
     except OSError as error:
         raise OSError(f"cannot make {folder} ({error.strerror}); run where the folder runs can be written") from None
-    writer = SummaryWriter(str(folder))
+
+
+def open_writer(args: Args, run: Run) -> SummaryWriter:
+    """Open a TensorBoard file that begins with the hyperparameters, and hides what came after the run's step."""
+    writer = SummaryWriter(str(run.folder), purge_step=run.step + 1 if run.step else None)
     rows = "\n".join(f"|{key}|{' '.join(str(value).split())}|" for key, value in asdict(args).items())
-    writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
+    writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}", run.step)
     return writer
 
 
@@ -1089,46 +1155,241 @@ def start_tracking(args: Args, name: str) -> None:
         import wandb
     except ImportError:
         raise ImportError('--track needs wandb: pip install -e ".[track]"') from None
-    where = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": name}
+    where = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": name, "id": name}
     try:
-        wandb.init(**where, sync_tensorboard=True, config=asdict(args), save_code=True)
+        wandb.init(**where, resume="allow", sync_tensorboard=True, config=asdict(args), save_code=True)
     except Exception as error:  # whatever wandb raises: no account, no such team, no network
         raise ValueError(f"--track: {error}; log in with `wandb login`, or leave --track out") from None
 
 
-def report(args: Args, run: Run, step: int, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
-    """Write an iteration's numbers to TensorBoard and the progress bar; evaluate first where that is due."""
+def report(args: Args, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
+    """End an iteration: evaluate, write to TensorBoard, move the progress bar, save; each where it is due.
+
+    Raises OSError if a file cannot be written, FloatingPointError if a weight is not finite.
+    """
     batch_size = args.num_envs * args.num_steps
-    is_last = step + batch_size > args.total_timesteps
-    if run.eval_envs is not None and (step // batch_size % args.eval_interval == 0 or is_last):
+    iteration, iterations = run.iteration, args.total_timesteps // batch_size
+    if run.eval_envs is not None and (iteration % args.eval_interval == 0 or iteration == iterations):
         for name, scores in level_scores(args, run).items():
             logs[f"eval/{name}"] = scores.mean().item()
-            run.writer.add_tensor(f"eval_levels/{name}", scores, step)
+            run.writer.add_tensor(f"eval_levels/{name}", scores, run.step)
+
+    logs, episodes, signals = zip(*all_gather((logs, episodes, run.signal)), strict=True)
+    logs, episodes, run.stop = mean_of(logs), joined(episodes), any(signals)
+    run.seconds += logs["charts/seconds_iteration"]
     logs |= {name: float(np.mean(values)) for name, values in episodes.items()}
-    logs["charts/SPS"] = step / run.seconds
-    for name, value in logs.items():
-        run.writer.add_scalar(name, value, step)
+    logs["charts/SPS"] = run.step / run.seconds
     run.returns.extend(episodes.get("charts/episodic_return", []))
     run.lengths.extend(episodes.get("charts/episodic_length", []))
-    shown = {name: f"{np.mean(last):.2f}" for name, last in (("return", run.returns), ("length", run.lengths)) if last}
-    run.bar.set_postfix({**shown, "SPS": f"{logs['charts/SPS']:.0f}"}, refresh=False)
-    run.bar.update(batch_size)
+    if run.writer is not None:
+        for name, value in logs.items():
+            run.writer.add_scalar(name, value, run.step)
+        last = {"return": run.returns, "length": run.lengths}
+        shown = {name: f"{np.mean(values):.2f}" for name, values in last.items() if values}
+        run.bar.set_postfix({**shown, "SPS": f"{logs['charts/SPS']:.0f}"}, refresh=False)
+        run.bar.update(batch_size)
+        if iteration * args.keep_models // iterations > (iteration - 1) * args.keep_models // iterations:
+            write_file(model_of(args, run), run.folder / f"model-{run.step}.pt")
+    is_last = run.stop or iteration == iterations
+    if args.checkpoint_interval and (iteration % args.checkpoint_interval == 0 or is_last):
+        save_checkpoint(args, run)
 
 
-def save_model(agent: Agent, args: Args, path: str | Path) -> None:
-    """Write weights, arguments and the script's name to path, atomically.
+def rank_and_size() -> tuple[int, int]:
+    """Return this process's rank, and how many processes train together: 0 and 1 unless torchrun started them."""
+    return (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
 
-    Raises FloatingPointError, and writes nothing, if a weight is not finite.
+
+@contextlib.contextmanager
+def lost_process() -> Iterator[None]:
+    """Raise ConnectionError with one line for the user if another process does not answer."""
+    try:
+        yield
+    except RuntimeError as error:  # what Gloo and NCCL raise
+        raise ConnectionError("another process of this run has ended; its own output says why") from error
+
+
+def all_gather(value: Any) -> list[Any]:
+    """Return the value of every process, in the order of ranks. Raises ConnectionError if one has ended."""
+    values = [value] * rank_and_size()[1]
+    if dist.is_initialized():
+        with lost_process():
+            dist.all_gather_object(values, value)
+    return values
+
+
+def average_gradients(agent: Agent, num_steps: int) -> None:
+    """Replace each gradient, a mean over num_steps here, by the mean over the steps of all processes.
+
+    Raises ConnectionError if one has ended.
     """
-    if not all(weight.isfinite().all() for weight in agent.state_dict().values()):
-        raise FloatingPointError(f"the training diverged: {path} is not written; try a lower --init-lr")
-    saved = {"script": Path(__file__).stem, "args": asdict(args), "weights": agent.state_dict()}
-    torch.save(saved, f"{path}.part")
-    os.replace(f"{path}.part", path)
+    if not dist.is_initialized():
+        return
+    gradients = [parameter.grad for parameter in agent.parameters()]
+    flat = parameters_to_vector([*gradients, gradients[0].new_ones(1)]) * num_steps
+    with lost_process():
+        dist.all_reduce(flat)
+    vector_to_parameters(flat[:-1] / flat[-1], gradients)
+
+
+def mean_of(logs: tuple[dict[str, float], ...]) -> dict[str, float]:
+    """Return the mean of what the processes log; where it is about the worst sample, the largest."""
+    named = {name: [each[name] for each in logs if name in each] for name in logs[0]}
+    return {name: max(v) if name == "losses/ratio_error" else float(np.mean(v)) for name, v in named.items()}
+
+
+def joined(episodes: tuple[dict[str, list[float]], ...]) -> dict[str, list[float]]:
+    """Return the metrics of the episodes of all processes."""
+    names = dict.fromkeys(itertools.chain(*episodes))
+    return {name: list(itertools.chain(*(each.get(name, []) for each in episodes))) for name in names}
+
+
+def model_of(args: Args, run: Run) -> dict[str, Any]:
+    """Return what a model's file holds, which is a part of what a checkpoint holds."""
+    saved = {"script": Path(__file__).stem, "args": asdict(replace(args, resume=None)), "step": run.step}
+    return saved | {"weights": run.agent.state_dict()}
+
+
+def write_file(saved: dict[str, Any], path: Path) -> None:
+    """Write a model or a checkpoint atomically: the file is whole, or it is not there.
+
+    Raises FloatingPointError, and writes nothing, if a weight is not finite; OSError if it cannot be written.
+    """
+    if not all(weight.isfinite().all() for weight in saved["weights"].values()):
+        raise FloatingPointError(f"{path} is not written, since weights are not finite; try a lower --init-lr")
+    part, content = Path(f"{path}.part"), io.BytesIO()
+    torch.save(saved, content)
+    try:
+        part.write_bytes(content.getbuffer())
+        flush_to_disk(part)
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OSError(f"cannot write {path} ({error.strerror})") from None
+
+
+def flush_to_disk(path: Path) -> None:
+    """Have the system write the file to the disk, where even a power failure leaves it."""
+    with path.open("rb+") as file:
+        os.fsync(file.fileno())
+
+
+def save_checkpoint(args: Args, run: Run) -> None:
+    """Write all that a run goes on with, and keep the checkpoint before it. Raises what `write_file` raises."""
+    processes = all_gather(state_of_process(run))
+    if run.writer is None:
+        return
+    run.writer.flush()
+    for file in run.folder.glob("events.out.tfevents.*"):
+        flush_to_disk(file)  # a checkpoint means that the curves are there too
+    run_state = {"seconds": run.seconds, "returns": list(run.returns), "lengths": list(run.lengths)}
+    run_state["optimizer"] = run.optimizer.state_dict()
+    run_state["processes"] = convert(processes, np.ndarray, torch.from_numpy)  # plain files hold no arrays
+    write_file(model_of(args, run) | run_state, run.folder / f"checkpoint-{run.step}.pt")
+    for path in checkpoints_in(run.folder)[:-2]:
+        path.unlink()
+
+
+def state_of_process(run: Run) -> dict[str, Any]:
+    """Return what each process goes on with: environments, memory and generators, in arrays, tensors and numbers."""
+    rollout, overwritten = run.rollout, run.agent.memory.overwritten
+    memory = rollout.memory_state._asdict()
+    return {
+        "environments": save_state(run.envs),
+        "next_obs": rollout.next_obs,
+        "next_ground_truth": rollout.next_ground_truth,
+        "memory": {name: part for name, part in memory.items() if name not in overwritten},
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state(rollout.values.device) if rollout.values.is_cuda else None,
+        "numpy": np.random.get_state(),  # noqa: NPY002 (it and Python's: environments of other packages may use them)
+        "python": random.getstate(),
+    }
+
+
+def load_checkpoint(run: Run, saved: dict[str, Any]) -> None:
+    """Set a run that was just made to what `save_checkpoint` wrote: it goes on as if it had never stopped.
+
+    Environments of other packages begin new episodes, with a line that says so. Raises ValueError if weights or
+    environments do not fit.
+    """
+    load_weights(run.agent, saved, run.folder)
+    run.optimizer.load_state_dict(saved["optimizer"])
+    run.step, run.seconds = saved["step"], saved["seconds"]
+    run.returns.extend(saved["returns"])
+    run.lengths.extend(saved["lengths"])
+    rank, rollout = rank_and_size()[0], run.rollout
+    state = saved["processes"][rank]
+    random.setstate(state["python"])
+    torch.set_rng_state(state["torch"])
+    if state["cuda"] is not None and rollout.values.is_cuda:
+        torch.cuda.set_rng_state(state["cuda"], rollout.values.device)
+    names = ("environments", "next_obs", "next_ground_truth", "numpy")
+    arrays = convert({name: state[name] for name in names}, Tensor, Tensor.numpy)
+    np.random.set_state(arrays["numpy"])  # noqa: NPY002
+    if arrays["environments"] is None:
+        if rank == 0:
+            print(f"{run.envs.spec.id} has no state to save: every environment begins a new episode", file=sys.stderr)
+        return
+    load_state(run.envs, arrays["environments"])
+    rollout.next_obs, rollout.next_ground_truth = arrays["next_obs"], arrays["next_ground_truth"]
+    device_of = {name: part.device for name, part in rollout.memory_state._asdict().items() if isinstance(part, Tensor)}
+    memory = {k: part.to(device_of[k]) if isinstance(part, Tensor) else part for k, part in state["memory"].items()}
+    rollout.memory_state = rollout.memory_state._replace(**memory)
+
+
+def convert(value: Any, kind: type, function: Callable) -> Any:
+    """Apply a function to all values of a kind in nested dicts, lists and tuples."""
+    if isinstance(value, dict):
+        return {name: convert(each, kind, function) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(convert(each, kind, function) for each in value)
+    return function(value) if isinstance(value, kind) else value
+
+
+def checkpoints_in(folder: str | Path) -> list[Path]:
+    """Return the checkpoints of a run, the latest last."""
+    return sorted(Path(folder).glob("checkpoint-*.pt"), key=lambda path: (len(path.name), path.name))
+
+
+def read_checkpoint(folder: str | Path) -> dict[str, Any]:
+    """Read a run's last checkpoint, which has all that `read_model` returns and more.
+
+    Raises ValueError if it is not whole, OSError if there is none.
+    """
+    if not (found := checkpoints_in(folder)):
+        raise OSError(f"--resume {folder}: there is no checkpoint-STEP.pt in this folder")
+    try:
+        return read_model(found[-1])
+    except ValueError as error:
+        before = f"go on from {found[-2]}" if len(found) > 1 else "begin again"
+        raise ValueError(f"{error}; remove it to {before}") from None
+
+
+def check_resumed(args: Args, saved: dict[str, Any]) -> None:
+    """Raise ValueError if the arguments are not those of the run that --resume goes on with."""
+    if saved["script"] != Path(__file__).stem:
+        raise ValueError(f"--resume {args.resume}: this run is {saved['script']}.py's, not {Path(__file__).name}'s")
+    if "processes" not in saved:
+        raise ValueError(f"--resume {args.resume}: its last checkpoint holds weights alone; --load-model takes these")
+    theirs = saved_args(saved)
+    for name in (each.name for each in fields(Args) if each.name not in ("resume", "total_timesteps")):
+        if getattr(args, name) != getattr(theirs, name):
+            raise ValueError(
+                f"{flag(name)} is {getattr(args, name)}, but the run in {args.resume} has {getattr(theirs, name)}; "
+                "leave the flag out, or begin another run"
+            )
+    if args.total_timesteps < theirs.total_timesteps:
+        raise ValueError(
+            f"--total-timesteps is {args.total_timesteps}, but the run in {args.resume} has {theirs.total_timesteps}; "
+            "it may be extended only"
+        )
+    before, processes = len(saved["processes"]), rank_and_size()[1]
+    if before != processes:
+        raise ValueError(f"--resume {args.resume}: this run has {before} processes, not {processes}; start as many")
 
 
 def read_model(path: str | Path) -> dict[str, Any]:
-    """Read a file that `save_model` wrote: the script's name, its arguments and the weights, on the CPU.
+    """Read a model or a checkpoint, to the CPU: the script's name, its arguments, the weights, and what more it holds.
 
     Raises ValueError if it is not such a file, OSError if it cannot be read.
     """
@@ -1137,11 +1398,11 @@ def read_model(path: str | Path) -> dict[str, Any]:
     try:
         with open(path, "rb") as file:
             saved = torch.load(file, map_location="cpu", weights_only=True)
-        return {"script": saved["script"], "args": dict(saved["args"]), "weights": dict(saved["weights"])}
+        return {**saved, "script": saved["script"], "args": dict(saved["args"]), "weights": dict(saved["weights"])}
     except OSError:
         raise
     except Exception:  # what torch.load raises for a file of another kind is many things, and none tells more
-        raise ValueError(f"{path} is not a model that --save-model wrote") from None
+        raise ValueError(f"{path} is cut short, or neither a model nor a checkpoint") from None
 
 
 def saved_args(saved: dict[str, Any]) -> Args:
@@ -1168,27 +1429,50 @@ def load_weights(agent: Agent, saved: dict[str, Any], path: str | Path) -> None:
         raise ValueError(f"{path} holds weights that are not finite: the training diverged")
 
 
+def stop_on_signals(run: Run) -> None:
+    """Have SIGINT (Ctrl-C) and SIGTERM end the training after the present iteration; a second one ends it at once."""
+
+    def stop(number: int, _: Any) -> None:
+        if run.signal:
+            raise KeyboardInterrupt
+        run.signal = number
+        if run.bar is not None:
+            tqdm.write("stopping at the end of this iteration; once more to stop at once", file=sys.stderr)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+
+
 def close(args: Args, run: Run) -> None:
-    """Save what was learned, if asked to, and close all files. Raises FloatingPointError as `save_model` does."""
+    """Save what was learned, if asked to, and close all files. Raises what `write_file` raises."""
     try:
-        if args.save_model:
-            save_model(run.agent, args, run.folder / "model.pt")
+        if args.save_model and run.writer is not None:
+            write_file(model_of(args, run), run.folder / "model.pt")
     finally:
-        run.bar.close()
-        run.writer.close()
-        for envs in filter(None, (run.envs, run.eval_envs)):
-            envs.close()
+        with contextlib.suppress(OSError):  # where the writer cannot write, it has said so before
+            for each in filter(None, (run.bar, run.envs, run.eval_envs, run.writer)):
+                each.close()
+        if dist.is_initialized():
+            dist.destroy_process_group()
 
 
 def run_to_end(args: Args, run: Run) -> Path:
-    """Train until it is done or Ctrl-C; return the run folder. Raises what `train` and `close` raise.
+    """Train until it is done or stopped; return the run folder. Raises what `train` and `close` raise.
 
-    With --save-model, what was learned is kept, whatever ends the training; but for weights that are not finite.
+    With --save-model, what was learned is kept, whatever ends the training, but for one that diverged.
     """
     try:
         train(args, run)
+        if run.writer is not None:
+            run.writer.flush()
     except KeyboardInterrupt:
         pass
+    except (FloatingPointError, OSError) as error:
+        args = replace(args, save_model=False)
+        reason = f"cannot write to {run.folder} ({error.strerror})" if getattr(error, "errno", None) else error
+        found = checkpoints_in(run.folder)
+        last = f"the last checkpoint is {found[-1]}" if found else "there is no checkpoint yet"
+        raise type(error)(f"iteration {run.iteration}: {reason}; {last}") from error
     finally:
         close(args, run)
     return run.folder
@@ -1377,13 +1661,15 @@ class GRUScan(torch.autograd.Function):
 
 
 if __name__ == "__main__":
-    args = parse_args(sys.argv[1:])
     try:
+        args = parse_args(sys.argv[1:])
         run = setup(args)
     except (ValueError, OSError, ImportError, gym.error.Error) as error:
         sys.exit(f"{Path(__file__).name}: {' '.join(str(error).split())}")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the training as Ctrl-C does
+    stop_on_signals(run)
+    threading.excepthook = lambda _: None  # what TensorBoard's thread cannot write, its next call raises here
     try:
         run_to_end(args, run)
-    except (MemoryLimit, FloatingPointError) as error:
+    except (MemoryLimit, FloatingPointError, OSError) as error:
         sys.exit(f"{Path(__file__).name}: {' '.join(str(error).split())}")
+    sys.exit(128 + run.signal if run.signal else 0)

@@ -46,6 +46,7 @@ def make_envs(
     num_envs: int,
     *,
     seed: int | None = None,
+    first_lane: int = 0,
     options: dict[str, Any] | None = None,
     num_levels: int = 0,
     start_level: int = 0,
@@ -98,7 +99,7 @@ def make_envs(
     if seed is not None:
         with one_line_errors(f"{env_id} cannot be reset"):
             # Neighbouring seeds must not share lanes, so the lanes' seeds count up from a hash of the seed.
-            envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]), options=options)
+            envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]) + first_lane, options=options)
     # An explicit seed is a level of its own, which nobody plays: what counts episodes comes after it.
     return EpisodeStatistics(envs)
 

@@ -2,6 +2,7 @@ import cue_recall  # noqa: F401 (registers CueRecall-v0)
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.util.tensor_util import make_ndarray
 
 import ppo_gru
 import ppo_trxl
@@ -40,6 +41,25 @@ def scalars():
         events = EventAccumulator(str(folder))
         events.Reload()
         return {name: [point.value for point in events.Scalars(name)] for name in events.Tags()["scalars"]}
+
+    return read
+
+
+@pytest.fixture
+def curves():
+    """Read all that a run has logged but what a clock measures: lists of (step, value) by name."""
+
+    def read(folder):
+        events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "tensors": 0})
+        events.Reload()
+        tags = events.Tags()
+        names = [name for name in tags["scalars"] if not name.startswith(("charts/SPS", "charts/seconds"))]
+        found = {name: [(point.step, point.value) for point in events.Scalars(name)] for name in names}
+        for name in tags["tensors"]:
+            if name.startswith("eval_levels/"):
+                points = events.Tensors(name)
+                found[name] = [(point.step, make_ndarray(point.tensor_proto).tolist()) for point in points]
+        return found
 
     return read
 

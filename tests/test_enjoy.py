@@ -361,7 +361,7 @@ def test_bad_input_is_one_line(saved):
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"checkpoint": enjoy.__file__}, "enjoy.py is not a model that --save-model wrote"),
+        ({"checkpoint": enjoy.__file__}, "enjoy.py is cut short, or neither a model nor a checkpoint"),
         ({"seed": -1}, "--seed is -1; it must be 0 or more"),
         ({"max_steps": 0}, "--max-steps is 0; it must be from 1 to 100000"),
         ({"out": "nowhere/page.html"}, "there is no folder nowhere"),

@@ -288,7 +288,7 @@ BAD = {
     "": "give either checkpoints to play with .* or --curves",
     "a.pt --curves runs": "give either checkpoints",
     "nowhere.pt": "there is no file nowhere.pt",
-    "notes.txt": "notes.txt is not a model that --save-model wrote",
+    "notes.txt": "notes.txt is cut short, or neither a model nor a checkpoint",
     "MODEL --levels 0": "--levels is 0; it must be 1 or more",
     "MODEL --max-steps 0": "--max-steps is 0",
     "MODEL --json no/where.json": "there is no folder no to write to",

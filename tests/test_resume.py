@@ -1,0 +1,396 @@
+"""A run that stops and goes on gives, to the last bit, the curves of the run that never stopped."""
+
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+import enjoy
+import evaluate
+import ppo_gru
+import ppo_trxl
+
+SCRIPTS = [ppo_gru, ppo_trxl]
+GRID = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector"}
+ENDLESS = {"env_id": "Endless-SearingSpotlights-v0", "obs_type": "vector"}
+RUNS = {
+    "GRU, pixels": {"env_id": "MortarMayhemB-Grid-v0"},
+    "GRU, endless": {**ENDLESS, "seq_len": 5, "num_layers": 2},
+    "LSTM": {**GRID, "memory": "lstm"},
+    "LSTM, endless pixels, reconstruction": {
+        "env_id": "Endless-MortarMayhem-v0", "memory": "lstm", "reconstruction_coef": 0.1
+    },
+    "no memory, stack": {**GRID, "memory": "none", "frame_stack": 3, "step_encoding": True, "norm_adv": True},
+    "GRU, ground truth": {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "ground_truth_coef": 0.1},
+    "GRU, probe": {**GRID, "ground_truth_coef": 0.1, "ground_truth_detach": True, "observe_last_action": True},
+    "GRU, evaluations": {**GRID, "eval_interval": 2, "eval_levels": 3, "eval_repeats": 2, "target_kl": 1e-4},
+    "GRU, truncated": {
+        "env_id": "SearingSpotlights-v0", "env_options": '{"max_steps": 9}', "bootstrap_truncated": True
+    },
+    "GRU, veil": {"env_id": "MysteryPath-v0", "spotlight_perturbation": True},
+    "TrXL, absolute": {"script": ppo_trxl, **GRID},
+    "TrXL, endless": {"script": ppo_trxl, "env_id": "Endless-MysteryPath-v0", "obs_type": "vector"},
+    "TrXL, learned": {
+        "script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "learned", "trxl_query_position": True
+    },
+    "TrXL, relative": {"script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "relative", "trxl_segment_length": 5},
+    "TrXL, no encoding": {"script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "none"},
+    "GTrXL, pixels, evaluations": {
+        "script": ppo_trxl, "env_id": "MortarMayhem-Grid-v0", "trxl_gate": "gru", "eval_interval": 1, "eval_levels": 1,
+        "eval_repeats": 2, "eval_max_steps": 30,
+    },
+    "TrXL, both heads": {
+        "script": ppo_trxl, "env_id": "SearingSpotlights-v0", "ground_truth_coef": 0.1, "reconstruction_coef": 0.1
+    },
+}  # fmt: skip
+
+
+def stop_after(monkeypatch, script, iteration):
+    """Have the training get SIGTERM in this iteration."""
+    update, updates = script.update, []
+
+    def updated(*given):
+        updates.append(1)
+        if len(updates) == iteration:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return update(*given)
+
+    monkeypatch.setattr(script, "update", updated)
+
+
+def interrupted(monkeypatch, script, args, iteration):
+    """Train until SIGTERM; return the run folder."""
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with monkeypatch.context() as patch:
+        stop_after(patch, script, iteration)
+        run = script.setup(args)
+        script.stop_on_signals(run)
+        try:
+            script.run_to_end(args, run)
+        finally:
+            for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
+                signal.signal(number, handler)
+    assert run.signal == signal.SIGTERM
+    assert run.step == iteration * args.num_envs * args.num_steps
+    return run.folder
+
+
+def resumed(script, folder, *flags):
+    return script.main(script.parse_args(["--resume", str(folder), *flags]))
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_resumed_run_is_the_unstopped_one(tiny, curves, monkeypatch, name):
+    changes = dict(RUNS[name])
+    script = changes.pop("script", ppo_gru)
+    args = tiny(script, total_timesteps=5 * 64, num_levels=50, seed=3, **changes)
+    whole = curves(script.main(args))
+    folder = interrupted(monkeypatch, script, args, 2)
+    stopped = curves(folder)
+    assert {step for step, _ in stopped["losses/loss"]} == {64, 128}
+    torch.manual_seed(99)
+    np.random.seed(99)  # noqa: NPY002
+    assert resumed(script, folder) == folder
+    assert curves(folder) == whole
+    assert len(whole["losses/loss"]) == 5
+    assert ("eval/return" in whole) == ("eval_interval" in changes)
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_longer_training_goes_on_where_the_shorter_one_ended(tiny, curves, script):
+    args = tiny(script, **GRID, anneal_steps=200)
+    short = script.main(args)
+    whole = curves(script.main(tiny(script, **GRID, anneal_steps=200, total_timesteps=256)))
+    resumed(script, short, "--total-timesteps", "256")
+    assert curves(short) == whole
+    assert resumed(script, short) == short, "there is nothing left to do"
+    assert curves(short) == whole
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_what_was_played_twice_is_logged_once(tiny, curves, monkeypatch, script):
+    """A crash two iterations after the checkpoint: these are played again."""
+    args = tiny(script, **GRID, total_timesteps=6 * 64, checkpoint_interval=2, keep_models=6)
+    whole = curves(script.main(args))
+    with monkeypatch.context() as patch:
+        updates, update = [], script.update
+
+        def crash(*given):
+            updates.append(1)
+            if len(updates) == 4:
+                raise RuntimeError("crash")
+            return update(*given)
+
+        patch.setattr(script, "update", crash)
+        run = script.setup(args)
+        with pytest.raises(RuntimeError, match="crash"):
+            script.run_to_end(args, run)
+    assert curves(run.folder)["losses/loss"] == whole["losses/loss"][:3]
+    assert resumed(script, run.folder) == run.folder
+    assert curves(run.folder) == whole
+    found = sorted(int(path.stem.partition("-")[2]) for path in run.folder.glob("model-*.pt"))
+    assert found == [64, 128, 192, 256, 320, 384]
+
+
+def test_which_files_are_kept(tiny):
+    folder = ppo_gru.main(tiny(**GRID, total_timesteps=10 * 64, checkpoint_interval=3, keep_models=3))
+    assert sorted(path.name for path in folder.glob("*.pt")) == [
+        "checkpoint-576.pt", "checkpoint-640.pt", "model-256.pt", "model-448.pt", "model-640.pt"
+    ]  # fmt: skip
+    assert ppo_gru.read_model(folder / "model-256.pt")["step"] == 256
+    folder = ppo_gru.main(tiny(**GRID, checkpoint_interval=0, exp_name="none"))
+    assert not list(folder.glob("*.pt"))
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_checkpoint_is_a_model_too(tiny, script):
+    args = tiny(script, **GRID, num_levels=50, save_model=True)
+    folder = script.main(args)
+    model, checkpoint = folder / "model.pt", folder / "checkpoint-128.pt"
+    scores = [
+        evaluate.score_checkpoints(evaluate.Config(checkpoints=(str(path),), levels=2, repeats=1, cuda=False))
+        for path in (model, checkpoint)
+    ]
+    assert scores[0][0]["agents"][0]["metrics"] == scores[1][0]["agents"][0]["metrics"]
+    enjoy.main(enjoy.Config(checkpoint=str(checkpoint), out="page.html", max_steps=5))
+    assert os.path.getsize("page.html") > 1000
+    run = script.setup(tiny(script, **GRID, load_model=str(checkpoint), exp_name="again"))
+    for name, weight in script.read_model(model)["weights"].items():
+        assert run.agent.state_dict()[name].equal(weight)
+    assert run.step == 0
+
+
+def test_environments_of_other_packages_begin_new_episodes(tiny, curves, monkeypatch, capfd):
+    args = tiny(env_id="CartPole-v1", total_timesteps=5 * 64)
+    folder = interrupted(monkeypatch, ppo_gru, args, 2)
+    capfd.readouterr()
+    run = ppo_gru.setup(ppo_gru.parse_args(["--resume", str(folder)]))
+    assert "CartPole-v1 has no state to save: every environment begins a new episode" in capfd.readouterr().err
+    first = ppo_gru.setup(tiny(env_id="CartPole-v1", exp_name="first"))
+    for name, part in run.rollout.next_obs.items():
+        assert not (part == first.rollout.next_obs[name]).all(axis=1).any(), "not the episodes that it began with"
+    assert not run.rollout.memory_state.hidden.any()
+    ppo_gru.run_to_end(args, run)
+    assert [step for step, _ in curves(folder)["losses/loss"]] == [64, 128, 192, 256, 320]
+
+
+def test_videos_go_on(tiny, monkeypatch):
+    pytest.importorskip("moviepy")
+    args = tiny(env_id="MortarMayhemB-Grid-v0", total_timesteps=8 * 64, capture_video=True)
+    whole = ppo_gru.main(args)
+    folder = interrupted(monkeypatch, ppo_gru, args, 2)
+    resumed(ppo_gru, folder)
+    names = [sorted(path.name for path in (each / "videos").glob("*.mp4")) for each in (whole, folder)]
+    assert names[0] == names[1]
+    assert len(names[0]) > 2
+
+
+def test_the_second_signal_ends_the_training_at_once(tiny, monkeypatch):
+    run = ppo_gru.setup(tiny(**GRID))
+    handlers = {}
+    monkeypatch.setattr(ppo_gru.signal, "signal", handlers.__setitem__)
+    ppo_gru.stop_on_signals(run)
+    handlers[signal.SIGINT](signal.SIGINT, None)
+    assert run.signal == signal.SIGINT
+    with pytest.raises(KeyboardInterrupt):
+        handlers[signal.SIGTERM](signal.SIGTERM, None)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_to_the_command(tiny, curves, tmp_path, number):
+    """As a cluster sends it at a time limit: checkpoint and model are written, and the curve goes on."""
+    flags = "--env-id MortarMayhemB-Grid-v0 --obs-type vector --hidden-size 8 --head-size 8 --num-envs 2 --num-steps 32"
+    flags = [*flags.split(), "--num-minibatches", "2", "--no-cuda", "--total-timesteps", "6400"]
+    command = [sys.executable, ppo_gru.__file__, *flags, "--save-model"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        deadline = threading.Timer(200, process.kill)
+        deadline.start()
+        while "SPS=" not in process.stderr.read(40):
+            assert process.poll() is None
+        process.send_signal(number)
+        said = process.stderr.read()
+        deadline.cancel()
+    assert process.returncode == 128 + number, said
+    assert "Traceback" not in said
+    (folder,) = tmp_path.glob("runs/*")
+    (checkpoint,) = folder.glob("checkpoint-*.pt")
+    assert ppo_gru.read_model(checkpoint)["step"] == ppo_gru.read_model(folder / "model.pt")["step"] < 6400
+    done = subprocess.run(
+        [sys.executable, ppo_gru.__file__, "--resume", str(folder)], cwd=tmp_path, stderr=subprocess.PIPE, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert curves(folder) == curves(ppo_gru.main(ppo_gru.parse_args(flags)))
+
+
+CONTRADICTIONS = {
+    "--env-id MysteryPath-v0": "--env-id is MysteryPath-v0, but the run in .* has MortarMayhemB-Grid-v0",
+    "--hidden-size 64": "--hidden-size is 64, but the run in .* has 32; leave the flag out, or begin another run",
+    "--seed 7": "--seed is 7, but the run in .* has 1",
+    "--preset laptop": "--preset is laptop, but the run in .* has thesis",
+    "--total-timesteps 64": "--total-timesteps is 64, but the run in .* has 128; it may be extended only",
+}
+
+
+@pytest.fixture
+def trained(tiny):
+    return ppo_gru.main(tiny(**GRID, checkpoint_interval=1))
+
+
+def fault(folder, *flags):
+    """Resume by command; return the one line that it ends in, having changed nothing."""
+    before = {path.name: path.read_bytes() for path in folder.iterdir()} if folder.is_dir() else None
+    command = [sys.executable, ppo_gru.__file__, "--resume", str(folder), *flags]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1
+    (line,) = done.stderr.strip().splitlines()
+    if before is not None:
+        assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    return line
+
+
+@pytest.mark.parametrize("flags", CONTRADICTIONS)
+def test_flags_that_contradict_the_run(trained, flags):
+    with pytest.raises(ValueError, match=CONTRADICTIONS[flags]):
+        resumed(ppo_gru, trained, *flags.split())
+
+
+def test_flags_that_repeat_the_run_s_are_no_contradiction(trained):
+    assert resumed(ppo_gru, trained, "--hidden-size", "32", "--env-id", "MortarMayhemB-Grid-v0") == trained
+
+
+def test_another_script_s_run(trained):
+    with pytest.raises(ValueError, match=r"this run is ppo_gru\.py's, not ppo_trxl\.py's"):
+        ppo_trxl.setup(ppo_trxl.Args(resume=str(trained)))
+
+
+def test_a_checkpoint_that_is_cut_short(trained, tmp_path):
+    last = trained / "checkpoint-128.pt"
+    content = last.read_bytes()
+    last.write_bytes(content[: len(content) // 2])
+    line = fault(trained)
+    assert re.fullmatch(
+        r"ppo_gru\.py: .*checkpoint-128\.pt is cut short, or neither a model nor a checkpoint; "
+        r"remove it to go on from .*checkpoint-64\.pt",
+        line,
+    )
+    last.unlink()
+    assert resumed(ppo_gru, trained) == trained
+    assert last.read_bytes() != content[: len(content) // 2]
+
+
+def test_a_folder_without_a_checkpoint(tmp_path):
+    with pytest.raises(OSError, match=r"--resume nowhere: there is no checkpoint-STEP\.pt in this folder"):
+        ppo_gru.parse_args(["--resume", "nowhere"])
+
+
+def test_weights_alone_are_no_checkpoint(trained):
+    torch.save(ppo_gru.read_model(trained / "checkpoint-128.pt") | {"processes": None}, trained / "checkpoint-128.pt")
+    saved = ppo_gru.read_model(trained / "checkpoint-128.pt")
+    del saved["processes"]
+    torch.save(saved, trained / "checkpoint-128.pt")
+    with pytest.raises(ValueError, match="its last checkpoint holds weights alone; --load-model takes these"):
+        resumed(ppo_gru, trained)
+
+
+def test_a_checkpoint_whose_arguments_were_changed(trained):
+    """Another network, and other environments, than the rest of the file is of."""
+    path = trained / "checkpoint-128.pt"
+    saved = ppo_gru.read_model(path)
+    torch.save({**saved, "args": saved["args"] | {"hidden_size": 64}}, path)
+    with pytest.raises(ValueError, match="holds the weights of another network"):
+        resumed(ppo_gru, trained)
+    torch.save({**saved, "args": saved["args"] | {"num_levels": 7}}, path)
+    with pytest.raises(ValueError, match="the saved state is of environments with num_levels 100000, not 7"):
+        resumed(ppo_gru, trained)
+
+
+class Malicious:
+    def __reduce__(self):
+        return os.system, ("touch owned",)
+
+
+@pytest.mark.parametrize("package", [pickle, torch])
+def test_a_malicious_pickle_runs_nothing(trained, package):
+    with (trained / "checkpoint-192.pt").open("wb") as file:
+        saved = {"script": "ppo_gru", "args": {}, "weights": {}, "processes": [Malicious()]}
+        pickle.dump(saved, file, protocol=2) if package is pickle else torch.save(saved, file)
+    assert "checkpoint-192.pt is cut short, or neither a model nor a checkpoint; remove it" in fault(trained)
+    assert not os.path.exists("owned")
+
+
+def limited(size, *flags):
+    """Train by command, with no file larger than size; return the line that it ends in."""
+    code = (
+        "import resource, runpy, sys; sys.argv = sys.argv[1:];"
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}));"
+        "runpy.run_path(sys.argv[0], run_name='__main__')"
+    )
+    command = [sys.executable, "-c", code, ppo_gru.__file__, *flags]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    return done.stderr.strip().splitlines()[-1]
+
+
+FEW = "--hidden-size 8 --head-size 8 --num-envs 2 --num-steps 8 --num-minibatches 2 --no-cuda --obs-type vector"
+FEW = ["--env-id", "MortarMayhemB-Grid-v0", *FEW.split()]
+
+
+def test_no_room_for_curves():
+    line = limited(20_000, *FEW, "--total-timesteps", "9600", "--checkpoint-interval", "0")
+    said = r"ppo_gru\.py: iteration \d+: cannot write to runs/\S+ \(File too large\); there is no checkpoint yet"
+    assert re.fullmatch(said, line), line
+
+
+def test_no_room_for_a_checkpoint(curves):
+    """The one before stays whole, and the run goes on from it when there is room again."""
+    interval = ["--checkpoint-interval", "10"]
+    folder = ppo_gru.main(ppo_gru.parse_args([*FEW, *interval, "--total-timesteps", "160"]))
+    kept = (folder / "checkpoint-160.pt").read_bytes()
+    line = limited(len(kept) // 2, "--resume", str(folder), "--total-timesteps", "480")
+    said = (
+        rf"ppo_gru\.py: iteration 20: cannot write {folder}/checkpoint-320\.pt \(File too large\); "
+        rf"the last checkpoint is {folder}/checkpoint-160\.pt"
+    )
+    assert re.fullmatch(said, line), line
+    assert [path.name for path in folder.glob("checkpoint*")] == ["checkpoint-160.pt"]
+    assert (folder / "checkpoint-160.pt").read_bytes() == kept
+    resumed(ppo_gru, folder, "--total-timesteps", "480")
+    assert curves(folder) == curves(ppo_gru.main(ppo_gru.parse_args([*FEW, "--total-timesteps", "480"])))
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_gradient_that_is_no_number(tiny, monkeypatch, script):
+    """Training stops before the step, and neither the weights nor any file are spoilt."""
+    args = tiny(script, **GRID, total_timesteps=5 * 64, checkpoint_interval=1, save_model=True)
+    run = script.setup(args)
+    losses, ppo_loss = [], script.ppo_loss
+
+    def spoilt(*given):
+        loss, log = ppo_loss(*given)
+        losses.append({name: weight.clone() for name, weight in run.agent.state_dict().items()})
+        return (loss * float("nan"), log) if len(losses) == 11 else (loss, log)  # the third one of iteration 3
+
+    monkeypatch.setattr(script, "ppo_loss", spoilt)
+    said = r"iteration 3: the loss or its gradient is not finite; .*; the last checkpoint is \S+checkpoint-128\.pt"
+    with pytest.raises(FloatingPointError, match=said):
+        script.run_to_end(args, run)
+    for name, weight in run.agent.state_dict().items():
+        assert weight.equal(losses[-1][name]), "the step was not taken"
+        assert weight.isfinite().all()
+    assert sorted(path.name for path in run.folder.glob("*.pt")) == ["checkpoint-128.pt", "checkpoint-64.pt"]
+
+
+def test_weights_that_are_no_numbers_are_not_written(tiny, tmp_path):
+    run = ppo_gru.setup(tiny(**GRID))
+    next(run.agent.parameters()).data[0] = float("inf")
+    with pytest.raises(FloatingPointError, match=r"file\.pt is not written, since weights are not finite; try a lower"):
+        ppo_gru.write_file(ppo_gru.model_of(tiny(**GRID), run), tmp_path / "file.pt")
+    assert not list(tmp_path.glob("file*"))
