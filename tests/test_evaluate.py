@@ -154,7 +154,7 @@ def test_dense_curves_are_averaged():
 
 
 def test_curves_without_common_steps():
-    with pytest.raises(ValueError, match="no steps in common"):
+    with pytest.raises(ValueError, match="do not overlap; leave out the shortest run"):
         evaluate.align([(np.array([1, 2]), np.zeros((2, 1))), (np.array([3]), np.zeros((1, 1)))])
 
 
@@ -224,6 +224,107 @@ def test_the_arguments_of_an_older_run():
     changed = {"script": "ppo_gru", "seed": "3", "num_envs": "4", "env_id": "A-v0"}
     assert evaluate.hyperparameters(run) == defaults | changed
     assert [each.tolist() for each in evaluate.read_curve(run, "eval/return")] == [[10], [[2]]]
+
+
+# ---- curves over time ----
+def write_events(folder, seed, seconds, begin=0, purge_step=None, **params):
+    """Write an event file of a training: seconds (I, 2) of collecting and updating, an iteration every 100 steps."""
+    rows = "\n".join(f"|{name}|{value}|" for name, value in {"seed": seed, "env_id": "A-v0", **params}.items())
+    with SummaryWriter(folder, purge_step=purge_step) as writer:
+        writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
+        for iteration, (collect, update) in enumerate(seconds, 1):
+            step = begin + 100 * iteration
+            writer.add_scalar("charts/episodic_return", step / 100, step)
+            writer.add_scalar("charts/seconds_iteration", collect + update, step)
+            writer.add_scalar("charts/seconds_collect", collect, step)
+            writer.add_scalar("charts/seconds_update", update, step)
+    return folder
+
+
+def write_old_events(folder, seed):
+    """Write an event file as versions wrote it that did not measure seconds."""
+    with SummaryWriter(folder) as writer:
+        writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n|seed|{seed}|\n|env_id|A-v0|")
+        writer.add_scalar("charts/episodic_return", 1.0, 100)
+        writer.add_scalar("charts/episodic_return", 2.0, 200)
+    return folder
+
+
+def test_hours_of_training():
+    run = evaluate.read_run(write_events("a", 1, [(900, 900), (2700, 900), (0, 1800)]))
+    assert evaluate.training_hours(run, np.array([50, 100, 150, 200, 300])).tolist() == [0.25, 0.5, 1, 1.5, 2]
+
+
+def test_a_resumed_run_counts_its_seconds_once(caplog):
+    """It stopped in iteration 5 and goes on after iteration 2, as its second file's first event says."""
+    write_events("a", 1, [(1, 1), (2, 1), (30, 10), (40, 10)], num_steps=64)
+    (first,) = Path("a").iterdir()
+    first.rename("a/events.out.tfevents.0")  # the files are read in the order of their names
+    write_events("a", 1, [(3, 1), (4, 1), (5, 1)], begin=200, purge_step=201, num_steps=128)
+    run = evaluate.read_run("a")
+    steps, seconds = evaluate.read_seconds(run, "iteration")
+    assert (steps.tolist(), seconds.tolist()) == ([100, 200, 300, 400, 500], [2, 3, 4, 5, 6])
+    assert evaluate.training_hours(run, np.array([500]))[0] == pytest.approx(20 / 3600)
+    assert evaluate.read_curve(run, "charts/episodic_return")[0].tolist() == [100, 200, 300, 400, 500]
+    assert evaluate.wall_time([run])["hours"] == pytest.approx(20 / 3600)
+    assert evaluate.hyperparameters(run)["num_steps"] == "128", "those that it was resumed with"
+    assert not caplog.records, "TensorBoard calls it a crash"
+
+
+def test_curves_over_time_are_aligned_in_hours():
+    fast = evaluate.read_run(write_events("a", 1, [(1800, 1800)] * 3))  # 1, 2 and 3 hours
+    slow = evaluate.read_run(write_events("b", 2, [(3600, 3600)] * 3))  # 2, 4 and 6 hours
+    axis = Figure().subplots()
+    last = evaluate.draw_metric(axis, "charts/episodic_return", {"gru": [fast, slow]}, "time")
+    (line,) = axis.lines
+    assert line.get_xdata().tolist() == [2, 3], "as far as both reach"
+    assert line.get_ydata().tolist() == [1.5, 2.25]
+    assert last["gru"].tolist() == [[3], [1.5]]
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("hours of training", "charts/episodic_return")
+    assert axis.xaxis.get_major_formatter()(0.025) == "0.025"
+
+
+def test_wall_times(capsys):
+    """Of eight iterations, the IQM leaves out two at each end."""
+    runs = (
+        write_events("a", 1, [(1, 0), (1, 1), (2, 1), (2, 2)]),
+        write_events("b", 2, [(3, 2), (6, 3), (7, 3), (50, 10)]),
+        write_events("c", 1, [(3600, 3600)], gamma=0.5),
+    )
+    evaluate.main(evaluate.Config(curves=runs, json="ends.json"))
+    (task,) = json.loads(Path("ends.json").read_text())
+    found = {agent["agent"]: agent["wall_time"] for agent in task["agents"]}
+    seconds = [1, 2, 3, 4, 5, 9, 10, 60]
+    assert found["gamma=0.995"] == pytest.approx(
+        {
+            "mean": 11.75,
+            "std": np.std(seconds),
+            "min": 1,
+            "median": 4.5,
+            "iqm": 5.25,
+            "max": 60,
+            "collect": 9,
+            "update": 22 / 8,
+            "hours": 47 / 3600,
+        }
+    )
+    said = capsys.readouterr().out
+    assert "A-v0, seconds of an iteration and hours of a training\n\n| agent | seeds | mean | std | min |" in said
+    assert "| gamma=0.995 | 2 | 11.750 | 18.478 | 1.000 | 4.500 | 5.250 | 60.000 | 9.000 | 2.750 | 0.013 |" in said
+    assert said.endswith(
+        "| gamma=0.5 | 1 | 7200.000 | 0.000 |" + 4 * " 7200.000 |" + 2 * " 3600.000 |" + " 2.000 |\n\n"
+    )
+
+
+def test_wall_times_are_left_out_where_runs_have_none(capsys):
+    new, old = write_events("a", 1, [(1, 1), (1, 1)]), write_old_events("b", 2)
+    (task,) = evaluate.draw_curves(evaluate.Config(curves=(new, old)))
+    assert "wall_time" not in task["agents"][0]
+    assert "seconds of an iteration" not in capsys.readouterr().out
+    other = write_events("c", 1, [(1, 1), (1, 1)], gamma=0.5)
+    (task,) = evaluate.draw_curves(evaluate.Config(curves=(new, old, other)))
+    assert ["wall_time" in agent for agent in task["agents"]] == [False, True]
+    assert "| gamma=0.5 | 1 | 2.000 |" in capsys.readouterr().out.split("hours of a training")[1]
 
 
 # ---- scores ----
@@ -297,12 +398,14 @@ BAD = {
     "--curves empty": "empty holds no curves",
     "--curves RUN --metrics coins": "no curve of coins in common; they all have .*eval/success",
     "--curves RUN --out no/where": "there is no folder no to write to",
+    "--curves old --over time": "old has no charts/seconds_iteration, .*; draw it --over steps, or leave it out",
 }
 
 
 def test_bad_input(agents, tmp_path):
     (tmp_path / "notes.txt").write_text("some notes")
     (tmp_path / "empty").mkdir()
+    write_old_events("old", 1)
     for line, fault in BAD.items():
         words = line.replace("MODEL", f"{agents[0]}/model.pt --levels 1").replace("RUN", agents[0]).split()
         with pytest.raises((ValueError, OSError), match=fault):
