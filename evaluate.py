@@ -1,13 +1,15 @@
 """Score trained agents on levels that they have never seen, or draw their sample-efficiency curves.
 
     python evaluate.py runs/*/model.pt --json scores.json
+    python evaluate.py runs/X/model-*.pt
     python evaluate.py --curves runs/* --out docs/curves
     python evaluate.py --curves runs/* --over time
 
-Runs whose arguments differ in nothing but the seed are the seeds of one agent. As in the thesis (6.1.2, 6.1.3), every
-seed plays 50 levels outside its training set, three times each. An agent's score is the interquartile mean (IQM): the
-mean of the middle half of what its seeds scored on the levels. The 95 % interval is a stratified bootstrap's over the
-seeds: how far the IQM would move with other seeds. A single seed cannot tell, and has none.
+Runs whose arguments differ in nothing but the seed are the seeds of one agent. Files of one run, written at different
+steps of the training, are agents of their own. As in the thesis (6.1.2, 6.1.3), every seed plays 50 levels outside its
+training set, three times each. An agent's score is the interquartile mean (IQM): the mean of the middle half of what
+its seeds scored on the levels. The 95 % interval is a stratified bootstrap's over the seeds: how far the IQM would move
+with other seeds. A single seed cannot tell, and has none.
 
 Shape letters: R seeds (training runs) of an agent, M levels, I iterations of a run, P points of a curve,
 B bootstrap resamples.
@@ -64,6 +66,9 @@ BOOKKEEPING |= {
     "eval_max_steps",
     "compile",
     "preset",
+    "resume",
+    "checkpoint_interval",
+    "keep_models",
 }
 RESAMPLES = 2000
 POINTS = 200  # of a curve; one that has more is averaged over neighbours
@@ -76,7 +81,7 @@ class Config:
     """Score checkpoints on unseen levels, or draw the curves of training runs."""
 
     checkpoints: tyro.conf.Positional[tuple[str, ...]] = ()
-    """model.pt files that --save-model wrote"""
+    """model files: model.pt that --save-model wrote, or those that were written during training"""
     levels: int = 50
     """levels to play, from start_level + num_levels on: those that follow the training levels (an agent that trained
     without a limit, --num-levels 0, has met none of the numbered levels)"""
@@ -174,17 +179,33 @@ def tasks_of(runs: dict[str, dict[str, Any]], title: Callable) -> dict[str, dict
 def agents_of(runs: dict[str, dict[str, Any]]) -> dict[str, list[str]]:
     """Put the runs that differ in nothing but the seed together; runs: their arguments by path.
 
-    Raises ValueError if two of them have the same seed too, since they tell no more than one.
+    The arguments of a model file include the step of the training at which it was written, if that is known. Seeds of
+    an agent may be at different steps; but where one seed is given at several, each step is an agent of its own.
+
+    Raises ValueError if two of them have the same seed and step too, since they tell no more than one.
     """
     agents = defaultdict(dict)
     for path, args in runs.items():
-        seeds = agents[tuple(sorted((k, v) for k, v in args.items() if k not in BOOKKEEPING))]
-        if args["seed"] in seeds:
-            twin = seeds[args["seed"]]
+        key = tuple(sorted((k, v) for k, v in args.items() if k not in BOOKKEEPING | {"step"}))
+        members, place = agents[key], (args["seed"], args.get("step", "unknown"))
+        if place in members:
+            twin = members[place]
             raise ValueError(f"{path} is the same agent and seed, {args['seed']}, as {twin}; leave one of them out")
-        seeds[args["seed"]] = path
-    members = [list(seeds.values()) for seeds in agents.values()]
-    return dict(zip(labels([runs[paths[0]] for paths in members]), members, strict=True))
+        members[place] = path
+    found = []
+    for members in agents.values():
+        for step, paths in steps_apart(members).items():
+            args = {name: value for name, value in runs[paths[0]].items() if name != "step"}
+            found.append((args if step is None else args | {"step": step}, paths))
+    return dict(zip(labels([args for args, _ in found]), [paths for _, paths in found], strict=True))
+
+
+def steps_apart(members: dict[tuple[Any, Any], str]) -> dict[Any, list[str]]:
+    """Sort an agent's paths, given by seed and step, by their step; all are under None if no seed is there twice."""
+    if len({seed for seed, _ in members}) == len(members):
+        return {None: list(members.values())}
+    steps = sorted({step for _, step in members}, key=lambda step: (step == "unknown", step))
+    return {step: [path for (_, each), path in members.items() if each == step] for step in steps}
 
 
 def labels(agents: list[dict[str, Any]]) -> list[str]:
@@ -407,7 +428,8 @@ class Checkpoint:
 
     path: str
     script: ModuleType  # that trained it
-    saved: dict[str, Any]  # as the script's read_model returns it
+    saved: dict[str, Any]  # what the script's saved_args and load_weights need
+    step: int | None  # of the training, at which it was written; None if the file does not tell
     args: Any  # the script's Args, with this evaluation's settings
 
     @classmethod
@@ -418,11 +440,15 @@ class Checkpoint:
             raise ValueError(f"{path} was trained by {saved['script']}.py, which evaluate.py does not know")
         script = SCRIPTS[saved["script"]]
         settings = {"eval_levels": config.levels, "eval_repeats": config.repeats, "eval_max_steps": config.max_steps}
-        return cls(path, script, saved, replace(script.saved_args(saved), cuda=config.cuda, **settings))
+        args = replace(script.saved_args(saved), cuda=config.cuda, **settings)
+        # A file to resume from holds much more, which would stay in memory.
+        needed = {name: saved[name] for name in ("script", "args", "weights")}
+        return cls(path, script, needed, saved.get("step"), args)
 
     def arguments(self) -> dict[str, Any]:
-        """Return the arguments by name, with the script's name."""
-        return {"script": self.script.__name__, **asdict(self.args)}
+        """Return the arguments by name, with the script's name, and the step if it is known."""
+        step = {} if self.step is None else {"step": self.step}
+        return {"script": self.script.__name__, **asdict(self.args), **step}
 
 
 def play(checkpoint: Checkpoint, seed: int) -> dict[str, np.ndarray]:

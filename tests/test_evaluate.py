@@ -108,6 +108,41 @@ def test_the_same_seed_twice_is_refused():
         evaluate.agents_of({"a": arguments(), "b": arguments(cuda=False)})
 
 
+def test_the_same_seed_at_different_steps_is_told_apart():
+    runs = {
+        "model-1000": arguments(step=1000, gamma=0.9),
+        "model-200": arguments(step=200, gamma=0.9),
+        "other": arguments(step=1000, gamma=0.9, seed=2),
+        "gamma": arguments(step=300, gamma=0.5),
+    }
+    assert evaluate.agents_of(runs) == {
+        "gamma=0.9 step=200": ["model-200"],
+        "gamma=0.9 step=1000": ["model-1000", "other"],
+        "gamma=0.5": ["gamma"],
+    }
+    del runs["gamma"]
+    assert list(evaluate.agents_of(runs)) == ["step=200", "step=1000"]
+    runs["old"] = arguments(gamma=0.9)
+    assert list(evaluate.agents_of(runs)) == ["step=200", "step=1000", "step=unknown"]
+
+
+def test_seeds_at_different_steps_are_one_agent():
+    runs = {"a": arguments(step=100), "b": arguments(step=200, seed=2), "old": arguments(seed=3)}
+    assert evaluate.agents_of(runs) == {"ppo_gru": ["a", "b", "old"]}
+
+
+def test_the_same_step_twice_is_refused():
+    runs = {"a": arguments(step=100), "b": arguments(step=200), "c": arguments(step=200, resume="runs/x")}
+    with pytest.raises(ValueError, match="c is the same agent and seed, 1, as b; leave one of them out"):
+        evaluate.agents_of(runs)
+
+
+@pytest.mark.parametrize("name", ["resume", "checkpoint_interval", "keep_models"])
+def test_how_a_run_was_kept_makes_no_other_agent(name):
+    runs = {"a": arguments(**{name: "1"}), "b": arguments(seed=2, **{name: "2"})}
+    assert evaluate.agents_of(runs) == {"ppo_gru": ["a", "b"]}
+
+
 def test_other_tasks_are_apart():
     other = arguments(env_options='{"show_goal": [true]}')
     spelled = arguments(env_options='{ "show_goal":[true] }', seed=2)
@@ -363,6 +398,29 @@ def test_a_checkpoint_is_read_once(agents, monkeypatch):
     models = tuple(f"{folder}/model.pt" for folder in agents)
     evaluate.main(evaluate.Config(models, max_steps=3, **FEW))
     assert sorted(read) == sorted(models)
+
+
+def test_several_files_of_a_run(agents, monkeypatch, capsys):
+    """Files of two seeds at steps 512 and 1024, and one of the other agent that is at another step."""
+    files = {f"{seed}/checkpoint-{step}.pt": (seed, step) for seed, step in itertools.product((0, 1), (1024, 512))}
+    files["2/model.pt"] = (2, 2048)
+    read = ppo_gru.read_model
+
+    def read_model(path):
+        run, step = files[path]
+        return read(f"{agents[run]}/model.pt") | {"step": step, "optimizer": {}}
+
+    monkeypatch.setattr(ppo_gru, "read_model", read_model)
+    config = evaluate.Config(tuple(files), max_steps=3, json="scores.json", **FEW)
+    assert evaluate.Checkpoint.read("2/model.pt", config).saved.keys() == {"script", "args", "weights"}
+    evaluate.main(config)
+    (task,) = json.loads(Path("scores.json").read_text())
+    assert {agent["agent"]: agent["runs"] for agent in task["agents"]} == {
+        "ppo_gru step=512": ["0/checkpoint-512.pt", "1/checkpoint-512.pt"],
+        "ppo_gru step=1024": ["0/checkpoint-1024.pt", "1/checkpoint-1024.pt"],
+        "ppo_trxl": ["2/model.pt"],
+    }
+    assert "| return | ppo_gru step=512 | 2 |" in capsys.readouterr().out
 
 
 def test_episodes_cut_short(agents, capsys):
