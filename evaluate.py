@@ -1,18 +1,23 @@
 """Score trained agents on levels that they have never seen, or draw their sample-efficiency curves.
 
     python evaluate.py runs/*/model.pt --json scores.json
+    python evaluate.py runs/X/model-*.pt
     python evaluate.py --curves runs/* --out docs/curves
+    python evaluate.py --curves runs/* --over time
 
-Runs whose arguments differ in nothing but the seed are the seeds of one agent. As in the thesis (6.1.2, 6.1.3), every
-seed plays 50 levels outside its training set, three times each. An agent's score is the interquartile mean (IQM): the
-mean of the middle half of what its seeds scored on the levels. The 95 % interval is a stratified bootstrap's over the
-seeds: how far the IQM would move with other seeds. A single seed cannot tell, and has none.
+Runs whose arguments differ in nothing but the seed are the seeds of one agent. Files of one run, written at different
+steps of the training, are agents of their own. As in the thesis (6.1.2, 6.1.3), every seed plays 50 levels outside its
+training set, three times each. An agent's score is the interquartile mean (IQM): the mean of the middle half of what
+its seeds scored on the levels. The 95 % interval is a stratified bootstrap's over the seeds: how far the IQM would move
+with other seeds. A single seed cannot tell, and has none.
 
-Shape letters: R seeds (training runs) of an agent, M levels, P points of a curve, B bootstrap resamples.
+Shape letters: R seeds (training runs) of an agent, M levels, I iterations of a run, P points of a curve,
+B bootstrap resamples.
 """
 
 import itertools
 import json
+import logging
 import os
 import sys
 import textwrap
@@ -20,7 +25,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -37,7 +42,7 @@ try:
     from matplotlib import color_sequences
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.ticker import EngFormatter
+    from matplotlib.ticker import EngFormatter, StrMethodFormatter
     from scipy.stats import trim_mean
 except ImportError as error:
     raise SystemExit(f'evaluate.py needs {error.name}: pip install -e ".[eval]"') from None
@@ -61,9 +66,14 @@ BOOKKEEPING |= {
     "eval_max_steps",
     "compile",
     "preset",
+    "resume",
+    "checkpoint_interval",
+    "keep_models",
 }
 RESAMPLES = 2000
 POINTS = 200  # of a curve; one that has more is averaged over neighbours
+# Scalars of every iteration, in seconds: the first is the sum of the others. Evaluations are in none of them.
+SECONDS = {name: f"charts/seconds_{name}" for name in ("iteration", "collect", "update")}
 
 
 @dataclass
@@ -71,7 +81,7 @@ class Config:
     """Score checkpoints on unseen levels, or draw the curves of training runs."""
 
     checkpoints: tyro.conf.Positional[tuple[str, ...]] = ()
-    """model.pt files that --save-model wrote"""
+    """model files: model.pt that --save-model wrote, or those that were written during training"""
     levels: int = 50
     """levels to play, from start_level + num_levels on: those that follow the training levels (an agent that trained
     without a limit, --num-levels 0, has met none of the numbered levels)"""
@@ -88,6 +98,8 @@ class Config:
 
     curves: tuple[str, ...] = ()
     """run folders whose curves to draw, instead of playing"""
+    over: Literal["steps", "time"] = "steps"
+    """what curves are drawn over: environment steps, or hours of training without evaluations"""
     out: str = "curves"
     """draw to OUT.png and OUT.svg"""
     metrics: tuple[str, ...] = ()
@@ -167,17 +179,33 @@ def tasks_of(runs: dict[str, dict[str, Any]], title: Callable) -> dict[str, dict
 def agents_of(runs: dict[str, dict[str, Any]]) -> dict[str, list[str]]:
     """Put the runs that differ in nothing but the seed together; runs: their arguments by path.
 
-    Raises ValueError if two of them have the same seed too, since they tell no more than one.
+    The arguments of a model file include the step of the training at which it was written, if that is known. Seeds of
+    an agent may be at different steps; but where one seed is given at several, each step is an agent of its own.
+
+    Raises ValueError if two of them have the same seed and step too, since they tell no more than one.
     """
     agents = defaultdict(dict)
     for path, args in runs.items():
-        seeds = agents[tuple(sorted((k, v) for k, v in args.items() if k not in BOOKKEEPING))]
-        if args["seed"] in seeds:
-            twin = seeds[args["seed"]]
+        key = tuple(sorted((k, v) for k, v in args.items() if k not in BOOKKEEPING | {"step"}))
+        members, place = agents[key], (args["seed"], args.get("step", "unknown"))
+        if place in members:
+            twin = members[place]
             raise ValueError(f"{path} is the same agent and seed, {args['seed']}, as {twin}; leave one of them out")
-        seeds[args["seed"]] = path
-    members = [list(seeds.values()) for seeds in agents.values()]
-    return dict(zip(labels([runs[paths[0]] for paths in members]), members, strict=True))
+        members[place] = path
+    found = []
+    for members in agents.values():
+        for step, paths in steps_apart(members).items():
+            args = {name: value for name, value in runs[paths[0]].items() if name != "step"}
+            found.append((args if step is None else args | {"step": step}, paths))
+    return dict(zip(labels([args for args, _ in found]), [paths for _, paths in found], strict=True))
+
+
+def steps_apart(members: dict[tuple[Any, Any], str]) -> dict[Any, list[str]]:
+    """Sort an agent's paths, given by seed and step, by their step; all are under None if no seed is there twice."""
+    if len({seed for seed, _ in members}) == len(members):
+        return {None: list(members.values())}
+    steps = sorted({step for _, step in members}, key=lambda step: (step == "unknown", step))
+    return {step: [path for (_, each), path in members.items() if each == step] for step in steps}
 
 
 def labels(agents: list[dict[str, Any]]) -> list[str]:
@@ -194,9 +222,10 @@ def labels(agents: list[dict[str, Any]]) -> list[str]:
 
 # ---- CURVES ----
 def read_run(folder: str) -> EventAccumulator:
-    """Read a run folder's TensorBoard file; raise ValueError if there is none or it holds no curves."""
+    """Read a run folder's TensorBoard files; raise ValueError if there is none or it holds no curves."""
     if not os.path.isdir(folder):
         raise ValueError(f"there is no run folder {folder}")
+    logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it warns of a crash where a run was resumed
     events = EventAccumulator(folder, size_guidance={"scalars": 0, "tensors": 0})
     events.Reload()
     tags = events.Tags()
@@ -208,9 +237,10 @@ def read_run(folder: str) -> EventAccumulator:
 def hyperparameters(events: EventAccumulator) -> dict[str, str]:
     """Return a run's arguments as text, from the Markdown table in its TensorBoard file.
 
-    An argument that is younger than the run has its default, one that no longer exists is left out.
+    An argument that is younger than the run has its default, one that no longer exists is left out. A resumed run has
+    written them more than once; the last ones count.
     """
-    rows = events.Tensors("hyperparameters/text_summary")[0].tensor_proto.string_val[0].decode().splitlines()[2:]
+    rows = events.Tensors("hyperparameters/text_summary")[-1].tensor_proto.string_val[0].decode().splitlines()[2:]
     given = dict(row[1:-1].split("|", 1) for row in rows)
     script = ppo_trxl if "trxl_dim" in given else ppo_gru
     return {"script": script.__name__} | {name: given.get(name, str(v)) for name, v in asdict(script.Args()).items()}
@@ -245,48 +275,124 @@ def read_curve(run: EventAccumulator, name: str) -> tuple[np.ndarray, np.ndarray
     return np.array(steps), np.array(values)
 
 
-def align(runs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Bring curves, steps and values (P, M) of each run, to common steps (P,): return these and scores (P, R, M).
+def read_seconds(run: EventAccumulator, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the steps (I,) at which a run's iterations ended, and the seconds (I,) of each: a name in SECONDS.
 
-    The steps are those of all runs, as far as every run reaches; between its own, a run's values are interpolated. More
-    than POINTS become so many by the mean of neighbours. Where runs have played different numbers of levels, each run's
-    mean is what compares, and M is 1. Raises ValueError if runs have no steps in common.
+    Steps that a resumed run played twice are there once: TensorBoard's reader drops the first ones.
+    """
+    points = run.Scalars(SECONDS[name])
+    return np.array([point.step for point in points]), np.array([point.value for point in points])
+
+
+def has_seconds(run: EventAccumulator) -> bool:
+    """Return whether a run has the seconds of its iterations, which runs of earlier versions do not have."""
+    return set(SECONDS.values()) <= set(run.Tags()["scalars"])
+
+
+def training_hours(run: EventAccumulator, steps: np.ndarray) -> np.ndarray:
+    """Return the hours (P,) that a run had been training for at these steps (P,), interpolated within iterations."""
+    ends, seconds = read_seconds(run, "iteration")
+    return np.interp(steps, [0, *ends], [0, *np.cumsum(seconds) / 3600])
+
+
+def align(runs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Bring curves, x (P,) and values (P, M) of each run, to a common x (P,): return it and scores (P, R, M).
+
+    x is steps or hours. The common x is that of all runs, as far as every run reaches; between its own, a run's values
+    are interpolated. More than POINTS become so many by the mean of neighbours. Where runs have played different
+    numbers of levels, each run's mean is what compares, and M is 1. Raises ValueError if the runs do not overlap.
     """
     if len({values.shape[1] for _, values in runs}) > 1:
-        runs = [(steps, values.mean(1, keepdims=True)) for steps, values in runs]
-    first, last = max(steps[0] for steps, _ in runs), min(steps[-1] for steps, _ in runs)
+        runs = [(x, values.mean(1, keepdims=True)) for x, values in runs]
+    first, last = max(x[0] for x, _ in runs), min(x[-1] for x, _ in runs)
     if first > last:
-        raise ValueError("the curves of an agent's seeds have no steps in common; leave out the shortest run")
-    steps = np.unique(np.concatenate([steps for steps, _ in runs]))
-    steps = steps[(first <= steps) & (steps <= last)]
-    curves = [[np.interp(steps, at, level) for level in values.T] for at, values in runs]  # R x M x (all steps,)
-    values = np.moveaxis(np.array(curves), -1, 0)  # (all steps, R, M)
-    parts = np.array_split(np.arange(len(steps)), min(len(steps), POINTS))
+        raise ValueError("the curves of an agent's seeds do not overlap; leave out the shortest run")
+    common = np.unique(np.concatenate([x for x, _ in runs]))
+    common = common[(first <= common) & (common <= last)]
+    curves = [[np.interp(common, x, level) for level in values.T] for x, values in runs]  # R x M x (all x,)
+    values = np.moveaxis(np.array(curves), -1, 0)  # (all x, R, M)
+    parts = np.array_split(np.arange(len(common)), min(len(common), POINTS))
     scores = np.stack([values[part].mean(0) for part in parts])  # (P, R, M)
-    return np.array([steps[part].mean() for part in parts]), scores
+    return np.array([common[part].mean() for part in parts]), scores
 
 
-def draw_metric(axis: Axes, name: str, agents: dict[str, list[EventAccumulator]]) -> dict[str, np.ndarray]:
-    """Draw a curve of every agent, its runs by label; return each one's last scores (R, M)."""
+def draw_metric(
+    axis: Axes, name: str, agents: dict[str, list[EventAccumulator]], over: str = "steps"
+) -> dict[str, np.ndarray]:
+    """Draw a curve of every agent, its runs by label, over steps or time; return each one's last scores (R, M)."""
     last = {}
     for (label, runs), color in zip(agents.items(), itertools.cycle(color_sequences["petroff10"]), strict=False):
-        steps, scores = align([read_curve(run, name) for run in runs])
-        marker = "o" if len(steps) == 1 else None  # a line of one point is not to be seen
+        curves = [read_curve(run, name) for run in runs]
+        if over == "time":
+            curves = [(training_hours(run, steps), values) for run, (steps, values) in zip(runs, curves, strict=True)]
+        x, scores = align(curves)
+        marker = "o" if len(x) == 1 else None  # a line of one point is not to be seen
         seeds = f"{len(runs)} seed{'s' * (len(runs) > 1)}"
-        axis.plot(steps, iqm(scores), color=color, marker=marker, label=f"{label}, {seeds}")
+        axis.plot(x, iqm(scores), color=color, marker=marker, label=f"{label}, {seeds}")
         if len(runs) > 1:
             band = np.stack([interval(point) for point in scores], axis=-1)  # (2, P); one after the other saves memory
-            axis.fill_between(steps, *band, color=color, alpha=0.2, linewidth=0)
+            axis.fill_between(x, *band, color=color, alpha=0.2, linewidth=0)
         last[label] = scores[-1]
-    axis.set(xlabel="steps", ylabel=name)
-    axis.xaxis.set_major_formatter(EngFormatter(sep=" "))
+    axis.set(xlabel="steps" if over == "steps" else "hours of training", ylabel=name)
+    # 2 M steps are 2,000,000, but 20 m hours would be 0.02.
+    axis.xaxis.set_major_formatter(EngFormatter(sep=" ") if over == "steps" else StrMethodFormatter("{x:g}"))
     axis.grid(alpha=0.3)
     return last
 
 
-def draw_curves(config: Config) -> list[dict[str, Any]]:
-    """Draw a row of pictures for each task, a column for each metric; print where the curves end, and return it."""
+def wall_time(runs: list[EventAccumulator]) -> dict[str, float]:
+    """Return an agent's wall time by name, for JSON, as in the thesis' tables 6.3 and 6.4.
+
+    mean to max: seconds of one iteration, over all iterations of all runs. collect, update: means of its two parts.
+    hours: the mean duration of a training.
+    """
+    durations = [read_seconds(run, "iteration")[1] for run in runs]
+    seconds = np.concatenate(durations)  # of all runs' iterations
+    parts = {
+        name: np.mean(np.concatenate([read_seconds(run, name)[1] for run in runs])) for name in ("collect", "update")
+    }
+    numbers = {
+        "mean": seconds.mean(),
+        "std": seconds.std(),
+        "min": seconds.min(),
+        "median": np.median(seconds),
+        "iqm": iqm(seconds[None]),
+        "max": seconds.max(),
+        **parts,
+        "hours": np.mean([each.sum() for each in durations]) / 3600,
+    }
+    return {name: float(number) for name, number in numbers.items()}
+
+
+def time_table(agents: list[dict[str, Any]]) -> str:
+    """Return the wall times in the summaries of agents that have one as a Markdown table, an agent a row."""
+    names = ("mean", "std", "min", "median", "IQM", "max", "collect", "update", "hours")
+    lines = [f"| agent | seeds | {' | '.join(names)} |", f"|---|---:|{'---:|' * len(names)}"]
+    for agent in agents:
+        if "wall_time" in agent:
+            cells = (agent["agent"], len(agent["runs"]), *(f"{agent['wall_time'][name.lower()]:.3f}" for name in names))
+            lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines)
+
+
+def read_runs(config: Config) -> dict[str, EventAccumulator]:
+    """Read the run folders; raise ValueError for one that cannot be drawn."""
     events = {path: read_run(path) for path in dict.fromkeys(config.curves)}
+    older = [path for path, run in events.items() if not has_seconds(run)]
+    if config.over == "time" and older:
+        raise ValueError(
+            f"{older[0]} has no {SECONDS['iteration']}, since an earlier version trained it; draw it --over steps, or "
+            "leave it out"
+        )
+    return events
+
+
+def draw_curves(config: Config) -> list[dict[str, Any]]:
+    """Draw a row of pictures for each task, a column for each metric; print where the curves end, and return it.
+
+    Wall times are printed and returned of the agents whose runs all have them.
+    """
+    events = read_runs(config)
     args = {path: hyperparameters(run) for path, run in events.items()}
     tasks = tasks_of(args, task_of)
     columns = len(config.metrics) or 1
@@ -298,12 +404,18 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
         env_id = next(args[path]["env_id"] for paths in agents.values() for path in paths)
         for axis, metric in zip(axes, config.metrics or [own_metric(env_id)], strict=True):
             name = curve_name(metric, list(itertools.chain(*runs.values())))
-            for label, scores in draw_metric(axis, name, runs).items():
+            for label, scores in draw_metric(axis, name, runs, config.over).items():
                 last[label][name] = scores
         axes[0].set_title(textwrap.fill(title, 55 * columns), loc="left", fontsize="medium")
         axes[0].legend(loc="upper left", bbox_to_anchor=(0, -0.17), frameon=False)  # below, clear of the curves
-        report.append({"task": title, "agents": [summary(label, agents[label], last[label]) for label in agents]})
-        print(f"{title}, where the curves end\n\n{table(report[-1]['agents'])}\n")
+        summaries = [summary(label, agents[label], last[label]) for label in agents]
+        for each in summaries:
+            if all(map(has_seconds, runs[each["agent"]])):
+                each["wall_time"] = wall_time(runs[each["agent"]])
+        report.append({"task": title, "agents": summaries})
+        print(f"{title}, where the curves end\n\n{table(summaries)}\n")
+        if any("wall_time" in each for each in summaries):
+            print(f"{title}, seconds of an iteration and hours of a training\n\n{time_table(summaries)}\n")
     for name in (f"{config.out}.png", f"{config.out}.svg"):
         figure.savefig(name, dpi=150)
     return report
@@ -316,7 +428,8 @@ class Checkpoint:
 
     path: str
     script: ModuleType  # that trained it
-    saved: dict[str, Any]  # as the script's read_model returns it
+    saved: dict[str, Any]  # what the script's saved_args and load_weights need
+    step: int | None  # of the training, at which it was written; None if the file does not tell
     args: Any  # the script's Args, with this evaluation's settings
 
     @classmethod
@@ -327,11 +440,15 @@ class Checkpoint:
             raise ValueError(f"{path} was trained by {saved['script']}.py, which evaluate.py does not know")
         script = SCRIPTS[saved["script"]]
         settings = {"eval_levels": config.levels, "eval_repeats": config.repeats, "eval_max_steps": config.max_steps}
-        return cls(path, script, saved, replace(script.saved_args(saved), cuda=config.cuda, **settings))
+        args = replace(script.saved_args(saved), cuda=config.cuda, **settings)
+        # A file to resume from holds much more, which would stay in memory.
+        needed = {name: saved[name] for name in ("script", "args", "weights")}
+        return cls(path, script, needed, saved.get("step"), args)
 
     def arguments(self) -> dict[str, Any]:
-        """Return the arguments by name, with the script's name."""
-        return {"script": self.script.__name__, **asdict(self.args)}
+        """Return the arguments by name, with the script's name, and the step if it is known."""
+        step = {} if self.step is None else {"step": self.step}
+        return {"script": self.script.__name__, **asdict(self.args), **step}
 
 
 def play(checkpoint: Checkpoint, seed: int) -> dict[str, np.ndarray]:

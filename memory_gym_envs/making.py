@@ -12,7 +12,7 @@ import json
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -45,7 +45,7 @@ def make_envs(
     env_id: str,
     num_envs: int,
     *,
-    seed: int | None = None,
+    seed: int | Sequence[int] | None = None,
     first_lane: int = 0,
     options: dict[str, Any] | None = None,
     num_levels: int = 0,
@@ -60,7 +60,11 @@ def make_envs(
     """Make a vector environment of N lanes with same-step autoreset; the caller's `reset(options=options)` begins.
 
     env_id: a Gymnasium id, or "module:id" if importing a module registers it.
-    seed: of all lanes, which get streams of their own; the next reset needs none. options: see `parse_options`.
+    seed: of all lanes, an integer or several from 0; the lanes get streams of their own, and the next reset needs none.
+    first_lane: the lanes are number first_lane, first_lane + 1, ... of a larger set: with the same seed, they have the
+        seeds and play the episodes of these lanes of it. Vector environments of other packages may seed all lanes
+        together, and then do not.
+    options: see `parse_options`.
     num_levels, start_level, obs_type: of Memory Gym environments; others have no such thing and ignore them, with a
         line on stderr where pictures are shown though vectors were asked for.
     frame_stack, step_encoding, observe_last_action, spotlight_perturbation: see GrayscaleStack and VectorStack,
@@ -69,10 +73,13 @@ def make_envs(
 
     Observations are dicts of pictures and vectors, see `ObservationParts`; actions are integers (N, A), see
     `branch_actions`; infos hold the statistics of ended episodes, see Gymnasium's vector RecordEpisodeStatistics.
+    What single environments raise in later steps and resets says which lane it was, see `LaneErrors`.
 
     Raises gymnasium.error.Error for an unknown id, ImportError for a missing package, ValueError for an environment
     that cannot be made or that is not supported, and for wrong arguments.
     """
+    if first_lane < 0:
+        raise ValueError(f"first_lane must be an integer of at least 0, not {first_lane}")
     spec, memory_gym = find_spec(env_id), is_memory_gym(env_id)
     levels = {"num_levels": num_levels, "start_level": start_level, "obs_type": obs_type}
     kwargs = levels if memory_gym else {}
@@ -96,10 +103,13 @@ def make_envs(
     if observe_last_action:
         envs = LastAction(envs)
 
+    first_seed = None
     if seed is not None:
         with one_line_errors(f"{env_id} cannot be reset"):
             # Neighbouring seeds must not share lanes, so the lanes' seeds count up from a hash of the seed.
-            envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0]) + first_lane, options=options)
+            first_seed = int(np.random.SeedSequence(seed).generate_state(1)[0]) + first_lane
+            envs.reset(seed=first_seed, options=options)
+    locate_errors(envs.unwrapped, first_lane, first_seed)  # only now, since the errors above have their own words
     # An explicit seed is a level of its own, which nobody plays: what counts episodes comes after it.
     return EpisodeStatistics(envs)
 
@@ -240,7 +250,59 @@ def one_line_errors(what: str) -> Iterator[None]:
     except (gym.error.Error, ImportError, OSError, MemoryError):
         raise
     except Exception as error:
-        raise ValueError(f"{what}: {' '.join((str(error) or repr(error)).split())}") from error
+        raise ValueError(f"{what}: {one_line(error) or repr(error)}") from error
+
+
+def one_line(error: Exception) -> str:
+    """The error's message without line breaks; empty if it has none."""
+    return " ".join(str(error).split())
+
+
+class LaneErrors(gym.Wrapper):
+    """One environment of several, whose errors say which it is and how to get there again.
+
+    What its step or reset raises becomes the cause of a RuntimeError, whose message has the number of the lane, the
+    seed that the environment was last reset with, and the number of the step since then. Automatic resets and those
+    without a seed do not start the count again.
+
+    seed: what it was reset with before, None for nothing.
+    """
+
+    def __init__(self, env: gym.Env, lane: int, seed: int | None):
+        super().__init__(env)
+        self._lane, self._seed, self._steps = lane, seed, 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """The environment's reset. Raises RuntimeError for what it raises."""
+        if seed is not None:
+            self._seed, self._steps = seed, 0
+        try:
+            return self.env.reset(seed=seed, options=options)
+        except Exception as error:
+            raise self._located(error, "the reset after step") from error
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """The environment's step. Raises RuntimeError for what it raises."""
+        self._steps += 1
+        try:
+            return self.env.step(action)
+        except Exception as error:
+            raise self._located(error, "step") from error
+
+    def _located(self, error: Exception, where: str) -> RuntimeError:
+        began = "it was made, never reset with a seed" if self._seed is None else f"its reset with seed {self._seed}"
+        what = f"{type(error).__name__} in {where} {self._steps} since {began}"
+        return RuntimeError(": ".join(filter(None, [f"environment {self._lane} raised {what}", one_line(error)])))
+
+
+def locate_errors(envs: VectorEnv, first_lane: int, first_seed: int | None) -> None:
+    """Put the environments that Gymnasium steps one after the other into `LaneErrors`.
+
+    first_lane, first_seed: the first one's number and what it was reset with; the others' count up from there.
+    """
+    if isinstance(envs, SyncVectorEnv):
+        seeds = [None if first_seed is None else first_seed + i for i in range(envs.num_envs)]
+        envs.envs = [LaneErrors(env, first_lane + i, seeds[i]) for i, env in enumerate(envs.envs)]
 
 
 # ---- actions ----

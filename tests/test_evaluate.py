@@ -108,6 +108,41 @@ def test_the_same_seed_twice_is_refused():
         evaluate.agents_of({"a": arguments(), "b": arguments(cuda=False)})
 
 
+def test_the_same_seed_at_different_steps_is_told_apart():
+    runs = {
+        "model-1000": arguments(step=1000, gamma=0.9),
+        "model-200": arguments(step=200, gamma=0.9),
+        "other": arguments(step=1000, gamma=0.9, seed=2),
+        "gamma": arguments(step=300, gamma=0.5),
+    }
+    assert evaluate.agents_of(runs) == {
+        "gamma=0.9 step=200": ["model-200"],
+        "gamma=0.9 step=1000": ["model-1000", "other"],
+        "gamma=0.5": ["gamma"],
+    }
+    del runs["gamma"]
+    assert list(evaluate.agents_of(runs)) == ["step=200", "step=1000"]
+    runs["old"] = arguments(gamma=0.9)
+    assert list(evaluate.agents_of(runs)) == ["step=200", "step=1000", "step=unknown"]
+
+
+def test_seeds_at_different_steps_are_one_agent():
+    runs = {"a": arguments(step=100), "b": arguments(step=200, seed=2), "old": arguments(seed=3)}
+    assert evaluate.agents_of(runs) == {"ppo_gru": ["a", "b", "old"]}
+
+
+def test_the_same_step_twice_is_refused():
+    runs = {"a": arguments(step=100), "b": arguments(step=200), "c": arguments(step=200, resume="runs/x")}
+    with pytest.raises(ValueError, match="c is the same agent and seed, 1, as b; leave one of them out"):
+        evaluate.agents_of(runs)
+
+
+@pytest.mark.parametrize("name", ["resume", "checkpoint_interval", "keep_models"])
+def test_how_a_run_was_kept_makes_no_other_agent(name):
+    runs = {"a": arguments(**{name: "1"}), "b": arguments(seed=2, **{name: "2"})}
+    assert evaluate.agents_of(runs) == {"ppo_gru": ["a", "b"]}
+
+
 def test_other_tasks_are_apart():
     other = arguments(env_options='{"show_goal": [true]}')
     spelled = arguments(env_options='{ "show_goal":[true] }', seed=2)
@@ -154,7 +189,7 @@ def test_dense_curves_are_averaged():
 
 
 def test_curves_without_common_steps():
-    with pytest.raises(ValueError, match="no steps in common"):
+    with pytest.raises(ValueError, match="do not overlap; leave out the shortest run"):
         evaluate.align([(np.array([1, 2]), np.zeros((2, 1))), (np.array([3]), np.zeros((1, 1)))])
 
 
@@ -226,6 +261,107 @@ def test_the_arguments_of_an_older_run():
     assert [each.tolist() for each in evaluate.read_curve(run, "eval/return")] == [[10], [[2]]]
 
 
+# ---- curves over time ----
+def write_events(folder, seed, seconds, begin=0, purge_step=None, **params):
+    """Write an event file of a training: seconds (I, 2) of collecting and updating, an iteration every 100 steps."""
+    rows = "\n".join(f"|{name}|{value}|" for name, value in {"seed": seed, "env_id": "A-v0", **params}.items())
+    with SummaryWriter(folder, purge_step=purge_step) as writer:
+        writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
+        for iteration, (collect, update) in enumerate(seconds, 1):
+            step = begin + 100 * iteration
+            writer.add_scalar("charts/episodic_return", step / 100, step)
+            writer.add_scalar("charts/seconds_iteration", collect + update, step)
+            writer.add_scalar("charts/seconds_collect", collect, step)
+            writer.add_scalar("charts/seconds_update", update, step)
+    return folder
+
+
+def write_old_events(folder, seed):
+    """Write an event file as versions wrote it that did not measure seconds."""
+    with SummaryWriter(folder) as writer:
+        writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n|seed|{seed}|\n|env_id|A-v0|")
+        writer.add_scalar("charts/episodic_return", 1.0, 100)
+        writer.add_scalar("charts/episodic_return", 2.0, 200)
+    return folder
+
+
+def test_hours_of_training():
+    run = evaluate.read_run(write_events("a", 1, [(900, 900), (2700, 900), (0, 1800)]))
+    assert evaluate.training_hours(run, np.array([50, 100, 150, 200, 300])).tolist() == [0.25, 0.5, 1, 1.5, 2]
+
+
+def test_a_resumed_run_counts_its_seconds_once(caplog):
+    """It stopped in iteration 5 and goes on after iteration 2, as its second file's first event says."""
+    write_events("a", 1, [(1, 1), (2, 1), (30, 10), (40, 10)], num_steps=64)
+    (first,) = Path("a").iterdir()
+    first.rename("a/events.out.tfevents.0")  # the files are read in the order of their names
+    write_events("a", 1, [(3, 1), (4, 1), (5, 1)], begin=200, purge_step=201, num_steps=128)
+    run = evaluate.read_run("a")
+    steps, seconds = evaluate.read_seconds(run, "iteration")
+    assert (steps.tolist(), seconds.tolist()) == ([100, 200, 300, 400, 500], [2, 3, 4, 5, 6])
+    assert evaluate.training_hours(run, np.array([500]))[0] == pytest.approx(20 / 3600)
+    assert evaluate.read_curve(run, "charts/episodic_return")[0].tolist() == [100, 200, 300, 400, 500]
+    assert evaluate.wall_time([run])["hours"] == pytest.approx(20 / 3600)
+    assert evaluate.hyperparameters(run)["num_steps"] == "128", "those that it was resumed with"
+    assert not caplog.records, "TensorBoard calls it a crash"
+
+
+def test_curves_over_time_are_aligned_in_hours():
+    fast = evaluate.read_run(write_events("a", 1, [(1800, 1800)] * 3))  # 1, 2 and 3 hours
+    slow = evaluate.read_run(write_events("b", 2, [(3600, 3600)] * 3))  # 2, 4 and 6 hours
+    axis = Figure().subplots()
+    last = evaluate.draw_metric(axis, "charts/episodic_return", {"gru": [fast, slow]}, "time")
+    (line,) = axis.lines
+    assert line.get_xdata().tolist() == [2, 3], "as far as both reach"
+    assert line.get_ydata().tolist() == [1.5, 2.25]
+    assert last["gru"].tolist() == [[3], [1.5]]
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("hours of training", "charts/episodic_return")
+    assert axis.xaxis.get_major_formatter()(0.025) == "0.025"
+
+
+def test_wall_times(capsys):
+    """Of eight iterations, the IQM leaves out two at each end."""
+    runs = (
+        write_events("a", 1, [(1, 0), (1, 1), (2, 1), (2, 2)]),
+        write_events("b", 2, [(3, 2), (6, 3), (7, 3), (50, 10)]),
+        write_events("c", 1, [(3600, 3600)], gamma=0.5),
+    )
+    evaluate.main(evaluate.Config(curves=runs, json="ends.json"))
+    (task,) = json.loads(Path("ends.json").read_text())
+    found = {agent["agent"]: agent["wall_time"] for agent in task["agents"]}
+    seconds = [1, 2, 3, 4, 5, 9, 10, 60]
+    assert found["gamma=0.995"] == pytest.approx(
+        {
+            "mean": 11.75,
+            "std": np.std(seconds),
+            "min": 1,
+            "median": 4.5,
+            "iqm": 5.25,
+            "max": 60,
+            "collect": 9,
+            "update": 22 / 8,
+            "hours": 47 / 3600,
+        }
+    )
+    said = capsys.readouterr().out
+    assert "A-v0, seconds of an iteration and hours of a training\n\n| agent | seeds | mean | std | min |" in said
+    assert "| gamma=0.995 | 2 | 11.750 | 18.478 | 1.000 | 4.500 | 5.250 | 60.000 | 9.000 | 2.750 | 0.013 |" in said
+    assert said.endswith(
+        "| gamma=0.5 | 1 | 7200.000 | 0.000 |" + 4 * " 7200.000 |" + 2 * " 3600.000 |" + " 2.000 |\n\n"
+    )
+
+
+def test_wall_times_are_left_out_where_runs_have_none(capsys):
+    new, old = write_events("a", 1, [(1, 1), (1, 1)]), write_old_events("b", 2)
+    (task,) = evaluate.draw_curves(evaluate.Config(curves=(new, old)))
+    assert "wall_time" not in task["agents"][0]
+    assert "seconds of an iteration" not in capsys.readouterr().out
+    other = write_events("c", 1, [(1, 1), (1, 1)], gamma=0.5)
+    (task,) = evaluate.draw_curves(evaluate.Config(curves=(new, old, other)))
+    assert ["wall_time" in agent for agent in task["agents"]] == [False, True]
+    assert "| gamma=0.5 | 1 | 2.000 |" in capsys.readouterr().out.split("hours of a training")[1]
+
+
 # ---- scores ----
 def test_scores_are_those_of_the_levels(agents, capsys):
     models = tuple(f"{folder}/model.pt" for folder in agents)
@@ -264,6 +400,29 @@ def test_a_checkpoint_is_read_once(agents, monkeypatch):
     assert sorted(read) == sorted(models)
 
 
+def test_several_files_of_a_run(agents, monkeypatch, capsys):
+    """Files of two seeds at steps 512 and 1024, and one of the other agent that is at another step."""
+    files = {f"{seed}/checkpoint-{step}.pt": (seed, step) for seed, step in itertools.product((0, 1), (1024, 512))}
+    files["2/model.pt"] = (2, 2048)
+    read = ppo_gru.read_model
+
+    def read_model(path):
+        run, step = files[path]
+        return read(f"{agents[run]}/model.pt") | {"step": step, "optimizer": {}}
+
+    monkeypatch.setattr(ppo_gru, "read_model", read_model)
+    config = evaluate.Config(tuple(files), max_steps=3, json="scores.json", **FEW)
+    assert evaluate.Checkpoint.read("2/model.pt", config).saved.keys() == {"script", "args", "weights"}
+    evaluate.main(config)
+    (task,) = json.loads(Path("scores.json").read_text())
+    assert {agent["agent"]: agent["runs"] for agent in task["agents"]} == {
+        "ppo_gru step=512": ["0/checkpoint-512.pt", "1/checkpoint-512.pt"],
+        "ppo_gru step=1024": ["0/checkpoint-1024.pt", "1/checkpoint-1024.pt"],
+        "ppo_trxl": ["2/model.pt"],
+    }
+    assert "| return | ppo_gru step=512 | 2 |" in capsys.readouterr().out
+
+
 def test_episodes_cut_short(agents, capsys):
     """What only an episode's end tells is unknown then, and not made up."""
     evaluate.main(evaluate.Config((f"{agents[0]}/model.pt",), max_steps=3, json="scores.json", **FEW))
@@ -297,12 +456,14 @@ BAD = {
     "--curves empty": "empty holds no curves",
     "--curves RUN --metrics coins": "no curve of coins in common; they all have .*eval/success",
     "--curves RUN --out no/where": "there is no folder no to write to",
+    "--curves old --over time": "old has no charts/seconds_iteration, .*; draw it --over steps, or leave it out",
 }
 
 
 def test_bad_input(agents, tmp_path):
     (tmp_path / "notes.txt").write_text("some notes")
     (tmp_path / "empty").mkdir()
+    write_old_events("old", 1)
     for line, fault in BAD.items():
         words = line.replace("MODEL", f"{agents[0]}/model.pt --levels 1").replace("RUN", agents[0]).split()
         with pytest.raises((ValueError, OSError), match=fault):

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import traceback
 import types
 
 import gymnasium as gym
@@ -56,6 +57,27 @@ class Image(gym.Env):
 
 
 gym.register("Image-v0", entry_point=Image)
+
+
+class Faulty(gym.Env):
+    """Works for 20 steps."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (3,))
+    action_space = gym.spaces.Discrete(2)
+    t = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        self.t += 1
+        if self.t == 20:
+            raise ValueError("out of order")
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+gym.register("Faulty-v0", entry_point=Faulty)
 
 
 @pytest.mark.parametrize("memory", MEMORIES)
@@ -125,6 +147,14 @@ def test_same_seed_same_curves(tiny, curves, script):
     for name in first:
         np.testing.assert_array_equal(first[name], second[name], err_msg=name)
     assert first["losses/policy_loss"] != other["losses/policy_loss"]
+
+
+def test_an_environment_that_fails(tiny):
+    """What the user sees is its own traceback, and in the last line which environment it is; checkpoints stay."""
+    with pytest.raises(RuntimeError, match=r"environment 0 raised ValueError in step 20 since .* seed \d+: ") as error:
+        ppo_gru.main(tiny(env_id="Faulty-v0", checkpoint_interval=1))
+    assert 'raise ValueError("out of order")' in "".join(traceback.format_exception(error.value))
+    assert glob.glob("runs/*/checkpoint-64.pt")
 
 
 def test_lanes_differ_and_neighbouring_seeds_share_none(tiny):

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import traceback
 import zlib
 from collections import OrderedDict
 from pathlib import Path
@@ -436,6 +437,48 @@ def test_neighbouring_seeds_share_no_lane_and_levels_are_the_training_s():
     assert set(envs.np_random_seed) <= {10, 11, 12}  # which is not played
 
 
+LARGER_SETS = [
+    ("MysteryPath-Grid-v0", {"num_levels": 5, "start_level": 3, "spotlight_perturbation": True}),
+    ("MortarMayhemB-Grid-v0", {"num_levels": 1000, "obs_type": "vector"}),
+    ("Endless-SearingSpotlights-v0", {"num_levels": 7}),
+    ("CartPole-v1", {}),
+    ("CueRecall-v0", {}),
+]
+
+
+@pytest.mark.parametrize("seed", [7, (7, 3)], ids=str)
+@pytest.mark.parametrize(("env_id", "arguments"), LARGER_SETS)
+def test_lanes_of_a_larger_set(env_id, arguments, seed):
+    """Seeds, levels, observations, rewards and ends are those of these lanes, through many automatic resets."""
+    whole = make_envs(env_id, 6, seed=seed, **arguments, **EVERYTHING)
+    part = make_envs(env_id, 4, seed=seed, first_lane=2, **arguments, **EVERYTHING)
+    seeds, ends = set(), 0
+    assert whole.unwrapped.np_random_seed[2:] == part.unwrapped.np_random_seed
+    starts = [envs.reset()[0] for envs in (whole, part)]
+    assert data_equivalence({name: values[2:] for name, values in starts[0].items()}, starts[1], exact=True)
+    rng = np.random.default_rng(0)
+    for _ in range(250):
+        actions = actions_of(whole, rng)
+        observations, *numbers, infos = whole.step(actions)
+        theirs, *their_numbers, their_infos = part.step(actions[2:])
+        assert data_equivalence({name: values[2:] for name, values in observations.items()}, theirs, exact=True)
+        assert data_equivalence([values[2:] for values in numbers], their_numbers, exact=True)
+        assert whole.unwrapped.np_random_seed[2:] == part.unwrapped.np_random_seed
+        seeds.update(part.unwrapped.np_random_seed)
+        ended = their_numbers[1] | their_numbers[2]
+        for lane in np.flatnonzero(ended):
+            assert data_equivalence(infos["final_obs"][2 + lane], their_infos["final_obs"][lane], exact=True)
+            ends += 1
+    assert ends > 4
+    assert len(seeds) >= 4
+
+
+def test_several_seeds():
+    one, same, other = (make_envs("MysteryPath-v0", 3, seed=seed).unwrapped.np_random_seed for seed in (7, [7], [7, 1]))
+    assert one == same
+    assert set(one).isdisjoint(other)
+
+
 def test_without_a_seed_the_caller_chooses_the_levels():
     envs = make_envs("MortarMayhemB-Grid-v0", 2)
     envs.reset(seed=[5, 9], options={"command_count": [3]})
@@ -615,6 +658,86 @@ def test_what_cannot_work_is_one_line(env_id, arguments, message):
     with pytest.raises((ValueError, ImportError, gym.error.Error), match=message) as error:
         make_envs(env_id, 2, **arguments)
     assert "\n" not in str(error.value)
+
+
+class Fragile(Shows):
+    """An environment that raises where its seed is even: in step 5 since then, or in the reset after step 6."""
+
+    def __init__(self, part, error):
+        super().__init__(NUMBER)
+        self.part, self.error, self.done = part, error, 0
+
+    def reset(self, *, seed=None, options=None):
+        if seed is not None:
+            self.seed, self.done = seed, 0
+        self.fail("reset", 6)
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        self.done += 1
+        self.fail("step", 5)
+        return super().step(action)
+
+    def fail(self, part, step):
+        if (self.part, self.done, self.seed % 2) == (part, step, 0):
+            raise self.error
+
+
+@pytest.mark.parametrize(
+    "error", [ValueError("no such\nroom"), OSError("no disk"), gym.error.Error("odd"), MemoryError()]
+)
+@pytest.mark.parametrize(("part", "where"), [("step", "step 5"), ("reset", "the reset after step 6")])
+def test_an_error_says_which_lane_and_when(part, where, error):
+    envs = make_envs(register(Fragile, part=part, error=error), 4, seed=3, first_lane=10)
+    seeds = [each.unwrapped.seed for each in envs.unwrapped.envs]
+    lane = next(lane for lane in range(4) if seeds[lane] % 2 == 0)
+    envs.reset()  # has no seed, as in the training scripts
+    with pytest.raises(RuntimeError) as found:
+        list(roll(envs, 6))
+    raised = type(error).__name__
+    message = f"environment {10 + lane} raised {raised} in {where} since its reset with seed {seeds[lane]}"
+    text = " ".join(str(error).split())
+    assert str(found.value) == (f"{message}: {text}" if text else message)
+    cause = found.value.__cause__
+    assert (type(cause), str(cause)) == (type(error), str(error))
+    assert traceback.extract_tb(cause.__traceback__)[-1].name == "fail", "where it happened"
+
+
+def test_an_error_after_a_reset_with_another_seed():
+    envs = make_envs(register(Fragile, part="step", error=ValueError("odd")), 3, seed=3)
+    list(roll(envs, 3))
+    envs.reset(seed=[1, 3, 8])
+    with pytest.raises(
+        RuntimeError, match="environment 2 raised ValueError in step 5 since its reset with seed 8: odd"
+    ):
+        list(roll(envs, 6))
+
+
+def test_an_error_without_a_seed():
+    envs = make_envs(register(Old, space=NUMBER), 2, first_lane=3)
+    message = "environment 3 raised TypeError in the reset after step 0 since it was made, never reset with a seed: "
+    with pytest.raises(RuntimeError, match=message):
+        envs.reset()
+
+
+class Unready(Shows):
+    def __init__(self, error):
+        super().__init__(NUMBER)
+        self.error = error
+
+    def reset(self, *, seed=None, options=None):
+        raise self.error
+
+
+@pytest.mark.parametrize("error", [gym.error.Error("odd"), ImportError("odd"), OSError("odd"), MemoryError("odd")])
+def test_errors_of_the_installation_stay_as_they_are_in_the_first_reset(error):
+    with pytest.raises(type(error), match=r"^odd$"):
+        make_envs(register(Unready, error=error), 2, seed=0)
+
+
+def test_lanes_count_from_zero():
+    with pytest.raises(ValueError, match="first_lane must be an integer of at least 0, not -1"):
+        make_envs("CartPole-v1", 2, first_lane=-1)
 
 
 def test_other_autoreset_is_refused():
