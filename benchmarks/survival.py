@@ -1,0 +1,149 @@
+"""Does a run survive? Kills one at random moments and resumes it; then watches a long one for leaks.
+
+    python benchmarks/survival.py --kills 100 --soak 200
+
+A killed run is resumed until it ends; its scalars, but for those that a clock measures, have to be those of a run that
+was never stopped. Kills are SIGKILL, which no program can answer, at moments that are uniform over the seconds of a
+process. The processes are forks of this one, so that these seconds are setup, training and writing, not imports.
+
+The soak writes a checkpoint after every iteration. Resident memory, open files and steps per second should be flat.
+"""
+
+import importlib
+import multiprocessing
+import os
+import random
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+
+import evaluate
+
+FLAGS = "--preset laptop --env-id MysteryPath-Grid-v0 --num-envs 4 --num-steps 32 --num-minibatches 2 --no-cuda"
+
+
+@dataclass
+class Config:
+    """What to try."""
+
+    script: str = "ppo_gru"
+    """the script, without .py"""
+    kills: int = 100
+    """how often to kill"""
+    seconds: float = 4.0
+    """longest life of a process that is killed"""
+    iterations: int = 30
+    """length of a run that is killed"""
+    soak: int = 200
+    """length of the run that is watched, in iterations"""
+    seed: int = 1
+    """seed of the moments"""
+
+
+def arguments(iterations: int, name: str) -> list[str]:
+    """Return the command line of a run that evaluates now and then, and writes a checkpoint every iteration."""
+    often = "--checkpoint-interval 1 --eval-interval 10 --eval-levels 2 --eval-repeats 1"
+    return [*FLAGS.split(), *often.split(), "--total-timesteps", str(iterations * 4 * 32), "--exp-name", name]
+
+
+def train(script: str, flags: list[str]) -> None:
+    """Train as the command line does, but silently."""
+    sys.stderr = open(os.devnull, "w")  # noqa: SIM115 (until the process ends)
+    module = importlib.import_module(script)
+    module.main(module.parse_args(flags))
+
+
+def comes_to_its_end(script: str, flags: list[str], seconds: float | None) -> bool:
+    """Train in a process, which is killed after so many seconds; return whether it ended before.
+
+    Raises RuntimeError if it failed.
+    """
+    process = multiprocessing.get_context("fork").Process(target=train, args=(script, flags))
+    process.start()
+    process.join(seconds)
+    if process.exitcode is None:
+        process.kill()
+        process.join()
+        return False
+    if process.exitcode:
+        raise RuntimeError(f"{script}.py {' '.join(flags)} ended with exit code {process.exitcode}")
+    return True
+
+
+def scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
+    """Return what a run has logged, (step, value) by name, but for what a clock measures."""
+    run = evaluate.read_run(str(folder))
+    names = [name for name in run.Tags()["scalars"] if not name.startswith(("charts/SPS", "charts/seconds"))]
+    return {name: [(point.step, point.value) for point in run.Scalars(name)] for name in names}
+
+
+def kill(config: Config) -> None:
+    """Kill so many times, and print the count. Raises RuntimeError if a run does not resume, or gives other scalars."""
+    moments, wanted = random.Random(config.seed), None
+    count = {"kills": 0, "before the first checkpoint": 0, "while a checkpoint was written": 0, "runs": 0}
+    while count["kills"] < config.kills or wanted is None:
+        name = f"run-{count['runs']}-{count['kills']}"
+        flags, folder = arguments(config.iterations, name), None
+        # The first run is never killed: the others are compared with it.
+        while not comes_to_its_end(
+            config.script, flags, None if wanted is None else moments.uniform(0, config.seconds)
+        ):
+            count["kills"] += 1
+            folder = next(Path("runs").glob(f"*__{name}__*"), None)
+            if folder is None or not list(folder.glob("checkpoint-*.pt")):
+                count["before the first checkpoint"] += 1
+                break
+            count["while a checkpoint was written"] += bool(list(folder.glob("*.part")))
+            flags = ["--resume", str(folder)]
+            time.sleep(1)  # TensorBoard sorts files by the second they begin in
+        else:
+            found = scalars(next(Path("runs").glob(f"*__{name}__*")))
+            wanted = wanted or found
+            if found != wanted:
+                raise RuntimeError(f"{folder} has other scalars than the run that was never stopped")
+            count["runs"] += 1
+    print(
+        f"{config.script}: {', '.join(f'{value} {name}' for name, value in count.items())}, all with the same scalars"
+    )
+
+
+def soak(config: Config) -> None:
+    """Train for so many iterations, a checkpoint after each, and print what they take, a row for each fifth."""
+    script = importlib.import_module(config.script)
+    args = script.parse_args([*arguments(1, "soak"), "--eval-interval", "0"])
+    run = script.setup(args)
+    batch_size, rows = args.total_timesteps, []
+    for _ in range(config.soak):
+        began = time.perf_counter()
+        script.train(args, run)
+        args.total_timesteps += batch_size
+        resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+        rows.append((resident, len(os.listdir("/proc/self/fd")), batch_size / (time.perf_counter() - began)))
+    script.close(args, run)
+    print(f"\n{config.script}, a checkpoint after each of {config.soak} iterations\n")
+    print("| iterations | resident memory, MiB | open files | steps per second |\n|---|---:|---:|---:|")
+    for part in np.array_split(np.arange(config.soak), 5):
+        memory, files, rate = np.array(rows)[part].T
+        print(f"| {part[0] + 1} to {part[-1] + 1} | {memory.max():.1f} | {files.max():.0f} | {np.median(rate):.0f} |")
+
+
+def main(config: Config) -> None:
+    """Do both, in a temporary folder."""
+    torch.set_num_threads(1)  # forks must not inherit threads
+    importlib.import_module("torch._dynamo")  # by the optimizer; else every fork spends most of its life on it
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        if config.kills:
+            kill(config)
+        if config.soak:
+            soak(config)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

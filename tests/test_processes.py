@@ -1,0 +1,181 @@
+"""Several processes that torchrun starts train one agent; here two, on the CPU."""
+
+import dataclasses
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+import ppo_gru
+import ppo_trxl
+
+SCRIPTS = [ppo_gru, ppo_trxl]
+GRID = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector"}
+WIDTH = {ppo_gru: "--hidden-size 16", ppo_trxl: "--trxl-dim 16 --trxl-memory-length 7"}
+ONE_UPDATE = """
+import importlib, sys
+import torch
+script = importlib.import_module(sys.argv[1])
+args, weights, rollout = torch.load("given.pt", weights_only=False)
+run = script.setup(args)
+rank, processes = script.rank_and_size()
+run.agent.load_state_dict(weights)
+lanes = torch.arange(args.num_envs).chunk(processes)[rank]
+for name, stored in rollout.items():
+    # Two processes, four lanes each: lanes are the second axis of a rollout, but for the transformer's cache.
+    setattr(run.rollout, name, stored[:, lanes] if isinstance(stored, torch.Tensor) else stored)
+run.rollout.obs = {name: part[:, lanes] for name, part in rollout["obs"].items()}
+memory = rollout["memory_state"]
+own = {"stored": memory[-1][:, lanes]} if script.__name__ == "ppo_gru" else {
+    "items": memory.items[:, lanes], "item_steps": memory.item_steps[:, lanes]
+}
+run.rollout.memory_state = memory._replace(**own)
+optimizer = torch.optim.SGD(run.agent.parameters(), lr=1.0)
+logs = script.update(run.agent, optimizer, run.rollout, 0.01, args)
+torch.save((run.agent.state_dict(), logs), f"updated{rank}.pt")
+script.close(args, run)
+"""
+
+
+def torchrun(*command, processes=2):
+    return [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}", *command]
+
+
+def flags_of(script, **changes):
+    flags = {"env-id": GRID["env_id"], "obs-type": "vector", "num-envs": 4, "num-steps": 16, "num-minibatches": 2}
+    flags |= {"head-size": 16, "total-timesteps": 6 * 64, **changes}
+    return [*WIDTH[script].split(), "--no-cuda", *(part for k, v in flags.items() for part in (f"--{k}", str(v)))]
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_two_processes_make_the_update_of_one(tiny, script):
+    """Given the same rollouts, each half of the lanes; one gradient step.
+
+    By plain gradient descent: AdamW divides a gradient by its size, also where that is no more than rounding.
+    """
+    changes = {"num_envs": 8, "num_minibatches": 1, "update_epochs": 1, "num_steps": 32}
+    args = tiny(script, **GRID, **changes, total_timesteps=256)
+    run = script.setup(args)
+    for _ in range(2):
+        script.collect(run.agent, run.envs, run.rollout, args)
+    rollout = run.rollout
+    rollout.advantages = torch.randn(rollout.values.shape)
+    rollout.returns = rollout.values + torch.randn(rollout.values.shape)
+    given = {field.name: getattr(rollout, field.name) for field in dataclasses.fields(rollout)}
+    weights = {name: weight.clone() for name, weight in run.agent.state_dict().items()}
+    torch.save((args, weights, given), "given.pt")
+    alone = script.update(run.agent, torch.optim.SGD(run.agent.parameters(), lr=1.0), rollout, 0.01, args)
+
+    Path("program.py").write_text(ONE_UPDATE)
+    environment = {**os.environ, "PYTHONPATH": os.path.dirname(script.__file__)}
+    subprocess.run(torchrun("program.py", script.__name__), env=environment, check=True, timeout=300)
+    (first, logs), (second, _) = (torch.load(f"updated{rank}.pt") for rank in (0, 1))
+    for name, weight in run.agent.state_dict().items():
+        assert first[name].equal(second[name]), "both processes have the same weights"
+        torch.testing.assert_close(first[name], weight, rtol=0, atol=1e-6)
+    assert any((weight - weights[name]).abs().max() > 1e-3 for name, weight in first.items()), "there was a step"
+    assert logs["losses/grad_norm"] == pytest.approx(alone["losses/grad_norm"], rel=1e-5)
+
+
+def test_gradients_are_means_over_steps(monkeypatch, tiny):
+    """Of 3 steps here and 1 step there, not of two halves."""
+    run = ppo_gru.setup(tiny(**GRID))
+    for parameter in run.agent.parameters():
+        parameter.grad = torch.full_like(parameter, 4.0)
+    monkeypatch.setattr(ppo_gru.dist, "is_initialized", lambda: True)
+    monkeypatch.setattr(ppo_gru.dist, "all_reduce", lambda flat: flat.add_(torch.full_like(flat, 8.0).index_fill_(
+        0, torch.tensor([len(flat) - 1]), 1.0)))  # fmt: skip
+    ppo_gru.average_gradients(run.agent, 3)
+    for parameter in run.agent.parameters():
+        assert (parameter.grad == (3 * 4.0 + 8.0) / 4).all()
+        assert parameter.grad.shape == parameter.shape
+
+
+def test_a_resumed_run_is_the_unstopped_one(curves):
+    script = ppo_trxl
+    extra = {"eval-interval": 2, "eval-levels": 2, "eval-repeats": 1, "target-kl": 0.01, "checkpoint-interval": 3}
+    flags = flags_of(script, **extra)
+    subprocess.run(torchrun(script.__file__, *flags, "--exp-name", "whole"), check=True, timeout=300)
+    half = [*flags, "--total-timesteps", "192", "--exp-name", "half"]
+    subprocess.run(torchrun(script.__file__, *half), check=True, timeout=300)
+    (whole,), (half,) = (list(Path("runs").glob(f"*{name}*")) for name in ("whole", "half"))
+    more = ["--resume", str(half), "--total-timesteps", "384"]
+    with pytest.raises(ValueError, match="this run has 2 processes, not 1; start as many"):
+        script.setup(script.parse_args(more))
+    subprocess.run(torchrun(script.__file__, *more), check=True, timeout=300)
+    before, after = curves(whole), curves(half)
+    assert {step for step, _ in before["losses/loss"]} == {64, 128, 192, 256, 320, 384}
+    for name in ("eval/return", "eval_levels/return"):  # where the shorter run ended it was evaluated too
+        after[name] = [(step, value) for step, value in after[name] if step != 192]
+    assert {name: points for name, points in after.items() if "eval" not in name} == {
+        name: points for name, points in before.items() if "eval" not in name
+    }
+    assert after["eval_levels/return"] == before["eval_levels/return"]
+    processes = script.read_model(half / "checkpoint-384.pt")["processes"]
+    assert len(processes) == 2
+    assert not processes[0]["torch"].equal(processes[1]["torch"]), "they choose other actions"
+
+
+def started(command):
+    """Start a training and wait for its first checkpoint; return the process."""
+    process = subprocess.Popen(torchrun(*command), stderr=subprocess.PIPE, text=True, start_new_session=True)
+    deadline = time.monotonic() + 200
+    while not list(Path("runs").glob("*/checkpoint-*.pt")):
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    return process
+
+
+def workers(process):
+    """Return the ids of torchrun's processes, in the order of ranks."""
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return sorted(int(child) for child in children if "ppo_gru" in Path(f"/proc/{child}/cmdline").read_text())
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the processes in /proc")
+@pytest.mark.parametrize("rank", [0, 1])
+def test_a_process_that_dies_ends_the_others(rank):
+    command = [ppo_gru.__file__, *flags_of(ppo_gru, **{"total-timesteps": 10**8, "checkpoint-interval": 1})]
+    process = started(command)
+    os.kill(workers(process)[rank], signal.SIGKILL)
+    began = time.monotonic()
+    said = process.communicate(timeout=60)[1]
+    assert time.monotonic() - began < 30
+    assert process.returncode != 0
+    assert "exitcode  : -9" in said, "torchrun says which one ended"
+    (folder,) = Path("runs").iterdir()
+    assert ppo_gru.read_checkpoint(folder)["step"] > 0
+    if rank == 1:
+        message = r"ppo_gru\.py: iteration \d+: another process of this run has ended; .*; the last checkpoint is "
+        assert re.search(message, said) or "Signal 15" in said
+
+
+def test_a_signal_to_torchrun():
+    command = [ppo_gru.__file__, *flags_of(ppo_gru, **{"total-timesteps": 10**8, "checkpoint-interval": 10})]
+    process = started(command)
+    deadline = threading.Timer(100, process.kill)
+    deadline.start()
+    process.terminate()
+    said = process.communicate()[1]
+    deadline.cancel()
+    assert process.returncode != 0
+    assert "another process of this run has ended" not in said
+    (folder,) = Path("runs").iterdir()
+    logged = ppo_gru.read_checkpoint(folder)["step"]
+    assert logged > 640 or logged % 640 == 0
+    assert "stopping at the end of this iteration" in said
+
+
+def test_environments_that_cannot_be_split():
+    command = [ppo_gru.__file__, *flags_of(ppo_gru, **{"num-envs": 3, "total-timesteps": 480})]
+    done = subprocess.run(torchrun(*command), capture_output=True, text=True, timeout=300)
+    assert "ppo_gru.py: --num-envs is 3; it must be a multiple of the 2 processes" in done.stderr
+    assert not Path("runs").exists()
