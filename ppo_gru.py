@@ -1045,19 +1045,36 @@ def make_agent(envs: gym.vector.VectorEnv, infos: dict, args: Args, device: torc
 
 
 def setup(args: Args) -> Run:
-    """Check the arguments and make everything, the run folder last: bad input raises before anything is written.
+    """Check the arguments and make everything, files last: bad input raises before anything is written.
 
-    Under torchrun, each process makes its share of the environments, and the first one what writes and evaluates.
     Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
     """
-    if dist.is_torchelastic_launched() and not dist.is_initialized():
+    if dist.is_torchelastic_launched() and not dist.is_initialized():  # by torchrun
         dist.init_process_group()
-    rank, processes = rank_and_size()
     check_args(args)
     checkpoint = None if args.resume is None else read_checkpoint(args.resume)
     if checkpoint is not None:
         check_resumed(args, checkpoint)
-    step = 0 if checkpoint is None else checkpoint["step"]
+    run = make_run(args, 0 if checkpoint is None else checkpoint["step"])
+    if args.load_model is not None and checkpoint is None:
+        load_weights(run.agent, read_model(args.load_model), args.load_model)
+    speed_up(run.agent, args, run.rollout.next_obs)
+    rank, _ = rank_and_size()
+    if rank == 0:
+        make_folder(args, run)
+    if checkpoint is not None:
+        load_checkpoint(run, checkpoint)
+    if rank == 0:
+        open_logs(args, run)
+    return run
+
+
+def make_run(args: Args, step: int) -> Run:
+    """Make environments, agent and optimizer of a run that begins at this step. Raises as `setup` does.
+
+    Of several processes, each has its share of the environments, and the first one evaluates.
+    """
+    rank, processes = rank_and_size()
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
     device = torch.device("cpu")
@@ -1070,8 +1087,7 @@ def setup(args: Args) -> Run:
     with enough_memory(args, device):
         mode = "debug_rgb_array" if args.capture_video else None
         share = args.num_envs // processes
-        # Where a checkpoint cannot set the environments, they must not begin with the same levels again.
-        seed = [args.seed, step] if step else args.seed
+        seed = [args.seed, step] if step else args.seed  # what no checkpoint can restore begins with other levels
         envs = environments(args, share, seed=seed, first_lane=rank * share, options=options, render_mode=mode)
         obs, infos = envs.reset(options=options)
         agent = make_agent(envs, infos, args, device)
@@ -1082,29 +1098,10 @@ def setup(args: Args) -> Run:
         eval_envs = environments(args, len(evaluation_levels(args))) if evaluates else None
     if rank > 0:  # the weights are those of every process, the actions are not
         torch.manual_seed(int(np.random.SeedSequence([args.seed, rank]).generate_state(1)[0]))
-    if args.load_model is not None and checkpoint is None:
-        load_weights(agent, read_model(args.load_model), args.load_model)
-    speed_up(agent, args, rollout.next_obs)
     # As a tensor, the learning rate is set in place; the weight decay is torch's default.
     optimizer = torch.optim.AdamW(agent.parameters(), lr=torch.tensor(args.init_lr), weight_decay=0.01, fused=True)
-
     folder = Path(args.resume or all_gather(new_folder(args))[0])
-    if rank == 0:
-        if args.track:
-            start_tracking(args, folder.name)
-        if args.resume is None:
-            make_folder(folder)
-        if args.capture_video:
-            envs = LaneVideo(envs, str(folder / "videos"))
-    run = Run(envs, eval_envs, agent, optimizer, rollout, folder)
-    if checkpoint is not None:
-        load_checkpoint(run, checkpoint)
-    if rank == 0:
-        run.writer = open_writer(args, run)
-        batch_size = args.num_envs * args.num_steps
-        whole = args.total_timesteps // batch_size * batch_size
-        run.bar = tqdm(total=whole, initial=step, unit=" steps", unit_scale=True)
-    return run
+    return Run(envs, eval_envs, agent, optimizer, rollout, folder, step=step)
 
 
 @contextlib.contextmanager
@@ -1130,20 +1127,27 @@ def new_folder(args: Args) -> Path:
     return next(folder for folder in itertools.chain([first], numbered) if not folder.exists())
 
 
-def make_folder(folder: Path) -> None:
-    """Make a run folder; raise OSError if that cannot be done, or if another run has made it."""
+def make_folder(args: Args, run: Run) -> None:
+    """Make the run folder, and what goes there from the first step on. Raises OSError, or as `start_tracking` does."""
+    if args.track:
+        start_tracking(args, run.folder.name)
     try:
-        folder.mkdir(parents=True)
+        run.folder.mkdir(parents=True, exist_ok=args.resume is not None)
     except OSError as error:
-        raise OSError(f"cannot make {folder} ({error.strerror}); run where the folder runs can be written") from None
+        where = "run where the folder runs can be written"
+        raise OSError(f"cannot make {run.folder} ({error.strerror}); {where}") from None
+    if args.capture_video:
+        run.envs = LaneVideo(run.envs, str(run.folder / "videos"))
 
 
-def open_writer(args: Args, run: Run) -> SummaryWriter:
-    """Open a TensorBoard file that begins with the hyperparameters, and hides what came after the run's step."""
-    writer = SummaryWriter(str(run.folder), purge_step=run.step + 1 if run.step else None)
+def open_logs(args: Args, run: Run) -> None:
+    """Open the TensorBoard file, which hides what was logged beyond the run's step, and the progress bar."""
+    run.writer = SummaryWriter(str(run.folder), purge_step=run.step + 1 if run.step else None)
     rows = "\n".join(f"|{key}|{' '.join(str(value).split())}|" for key, value in asdict(args).items())
-    writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}", run.step)
-    return writer
+    run.writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}", run.step)
+    batch_size = args.num_envs * args.num_steps
+    total = args.total_timesteps // batch_size * batch_size
+    run.bar = tqdm(total=total, initial=run.step, unit=" steps", unit_scale=True)
 
 
 def start_tracking(args: Args, name: str) -> None:
@@ -1174,14 +1178,13 @@ def report(args: Args, run: Run, logs: dict[str, float], episodes: dict[str, lis
             logs[f"eval/{name}"] = scores.mean().item()
             run.writer.add_tensor(f"eval_levels/{name}", scores, run.step)
 
-    logs, episodes, signals = zip(*all_gather((logs, episodes, run.signal)), strict=True)
-    logs, episodes, run.stop = mean_of(logs), joined(episodes), any(signals)
+    logs, episodes, run.stop = combined(all_gather((logs, episodes, run.signal)))
     run.seconds += logs["charts/seconds_iteration"]
-    logs |= {name: float(np.mean(values)) for name, values in episodes.items()}
-    logs["charts/SPS"] = run.step / run.seconds
     run.returns.extend(episodes.get("charts/episodic_return", []))
     run.lengths.extend(episodes.get("charts/episodic_length", []))
     if run.writer is not None:
+        logs |= {name: float(np.mean(values)) for name, values in episodes.items()}
+        logs["charts/SPS"] = run.step / run.seconds
         for name, value in logs.items():
             run.writer.add_scalar(name, value, run.step)
         last = {"return": run.returns, "length": run.lengths}
@@ -1232,16 +1235,19 @@ def average_gradients(agent: Agent, num_steps: int) -> None:
     vector_to_parameters(flat[:-1] / flat[-1], gradients)
 
 
-def mean_of(logs: tuple[dict[str, float], ...]) -> dict[str, float]:
-    """Return the mean of what the processes log; where it is about the worst sample, the largest."""
-    named = {name: [each[name] for each in logs if name in each] for name in logs[0]}
-    return {name: max(v) if name == "losses/ratio_error" else float(np.mean(v)) for name, v in named.items()}
+def combined(parts: list[tuple[dict, dict, int]]) -> tuple[dict[str, float], dict[str, list[float]], bool]:
+    """Combine what the processes found: the means of their logs, all episodes, and whether any got a signal.
 
-
-def joined(episodes: tuple[dict[str, list[float]], ...]) -> dict[str, list[float]]:
-    """Return the metrics of the episodes of all processes."""
-    names = dict.fromkeys(itertools.chain(*episodes))
-    return {name: list(itertools.chain(*(each.get(name, []) for each in episodes))) for name in names}
+    The ratio's error is about the worst sample, so the largest one counts.
+    """
+    logs, episodes, signals = zip(*parts, strict=True)
+    found = {name: [each[name] for each in logs if name in each] for name in logs[0]}
+    logs = {name: max(v) if name == "losses/ratio_error" else float(np.mean(v)) for name, v in found.items()}
+    joined = defaultdict(list)
+    for each in episodes:
+        for name, values in each.items():
+            joined[name] += values
+    return logs, joined, any(signals)
 
 
 def model_of(args: Args, run: Run) -> dict[str, Any]:
