@@ -516,6 +516,7 @@ class Decoder(nn.Sequential):
 # What the other sections use of a memory, whichever it is: Memory(args), an nn.Module of width D, and its MemoryState.
 # While acting: initial_state, begin_rollout, step (which also stores what the update needs), reset where an episode
 # ended. For the update: cut the rollout into pieces, and unroll pieces. And logs, numbers for TensorBoard.
+# A checkpoint holds the MemoryState, but for the fields named in `overwritten`.
 class MemoryState(NamedTuple):
     """What N environments remember. `t` and `hidden` are replaced step by step, `stored` is written in place."""
 

@@ -1,4 +1,4 @@
-"""Does a run survive? Kills one at random moments and resumes it; then watches a long one for leaks.
+"""Does a run survive, and what does that cost? Kills and resumes runs, watches a long one, and times checkpoints.
 
     python benchmarks/survival.py --kills 100 --soak 200
 
@@ -7,6 +7,9 @@ was never stopped. Kills are SIGKILL, which no program can answer, at moments th
 process. The processes are forks of this one, so that these seconds are setup, training and writing, not imports.
 
 The soak writes a checkpoint after every iteration. Resident memory, open files and steps per second should be flat.
+
+The cost of checkpoints is measured with the settings of both presets: the seconds of an iteration and of a checkpoint,
+and the share of the time that checkpoints take at the default --checkpoint-interval. All is done by one thread.
 """
 
 import importlib
@@ -42,6 +45,8 @@ class Config:
     """length of a run that is killed"""
     soak: int = 200
     """length of the run that is watched, in iterations"""
+    cost: bool = True
+    """time checkpoints too"""
     seed: int = 1
     """seed of the moments"""
 
@@ -133,8 +138,32 @@ def soak(config: Config) -> None:
         print(f"| {part[0] + 1} to {part[-1] + 1} | {memory.max():.1f} | {files.max():.0f} | {np.median(rate):.0f} |")
 
 
+def cost(config: Config) -> None:
+    """Print what checkpoints cost with each preset's settings."""
+    script = importlib.import_module(config.script)
+    print(f"\n{config.script}, checkpoints every {script.Args.checkpoint_interval} iterations\n")
+    print("| preset | environments x steps | iteration, s | checkpoint, s | MiB | share |")
+    print("|---|---|---:|---:|---:|---:|")
+    for preset in script.PRESETS:
+        args = script.parse_args(["--preset", preset, "--no-cuda", "--exp-name", preset])
+        args.total_timesteps = args.num_envs * args.num_steps
+        run = script.setup(args)
+        script.train(args, run)
+        seconds = []
+        for _ in range(5):
+            began = time.perf_counter()
+            script.save_checkpoint(args, run)
+            seconds.append(time.perf_counter() - began)
+        size = script.checkpoints_in(run.folder)[-1].stat().st_size / 2**20
+        script.close(args, run)
+        taken = float(np.median(seconds))
+        share = taken / (args.checkpoint_interval * run.seconds)
+        shape = f"{args.num_envs} x {args.num_steps}"
+        print(f"| {preset} | {shape} | {run.seconds:.2f} | {taken:.3f} | {size:.1f} | {share:.3%} |", flush=True)
+
+
 def main(config: Config) -> None:
-    """Do both, in a temporary folder."""
+    """Do all that is asked for, in a temporary folder."""
     torch.set_num_threads(1)  # forks must not inherit threads
     importlib.import_module("torch._dynamo")  # by the optimizer; else every fork spends most of its life on it
     with tempfile.TemporaryDirectory() as folder:
@@ -143,6 +172,8 @@ def main(config: Config) -> None:
             kill(config)
         if config.soak:
             soak(config)
+        if config.cost:
+            cost(config)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
 from unittest.mock import patch
@@ -20,6 +20,7 @@ from unittest.mock import patch
 import gymnasium as gym
 import pytest
 import tyro
+from torch.distributed import run as torchrun
 
 import memory_gym_envs  # noqa: F401 (registers the ids)
 import ppo_gru
@@ -49,9 +50,9 @@ def code(page: Path) -> list[str]:
 
 
 def commands(page: Path) -> list[str]:
-    """Return the page's calls of Python programs, without what the shell does with them."""
+    """Return the page's calls of Python programs and of torchrun, without what the shell does with them."""
     calls = [part.split(" > ")[0].strip() for text in code(page) for part in text.split(" && ")]
-    return sorted({call for call in calls if call.startswith("python ")})
+    return sorted({call for call in calls if call.startswith(("python ", "torchrun "))})
 
 
 COMMANDS = {f"{page.stem}-{i}": (page.name, call) for page in PAGES for i, call in enumerate(commands(page))}
@@ -63,12 +64,18 @@ each_flag = pytest.mark.parametrize(("flag", "page"), FLAGS.items(), ids=FLAGS)
 def parser(module: ModuleType) -> Callable[[list[str]], object]:
     """Return the function that parses a program's arguments; SystemExit is what it raises for wrong ones."""
     if hasattr(module, "Args"):
-        return module.parse_args
+        return partial(parse_training, module)
     if hasattr(module, "Config"):
         return lambda arguments: tyro.cli(module.Config, args=arguments)
     if hasattr(module, "argparse"):
         return lambda arguments: parse_with_argparse(module.main, arguments)
     return parse_without_flags
+
+
+def parse_training(script: ModuleType, arguments: list[str]) -> object:
+    """Parse a training's arguments; a run that it goes on with need not exist."""
+    with patch.object(script, "read_checkpoint", lambda folder: {"args": {}}):
+        return script.parse_args(arguments)
 
 
 def parse_with_argparse(main: Callable[[], None], arguments: list[str]) -> None:
@@ -179,7 +186,10 @@ def test_extras_exist(page):
 
 @each_command
 def test_command(page, command):
-    _, *words = shlex.split(command)
+    program, *words = shlex.split(command)
+    if program == "torchrun":
+        given = torchrun.get_args_parser().parse_args(words)
+        words = [given.training_script, *given.training_script_args]
     path, *arguments = words[1:] if words[0] == "-m" else words
     assert words[0] == "-m" or (ROOT / path).exists()
     wrong = error(parser(import_program(path)), arguments)
@@ -205,7 +215,7 @@ def test_flag_exists(page, flag):
 
 @pytest.mark.parametrize("flag", sorted(flag for flag in FLAGS if re.fullmatch(r"--[a-z-]+ [^A-Z|]+", flag)))
 def test_flag_takes_its_value(flag):  # capitals stand for a value, and bars divide the values that there are
-    wrong = [error(script.parse_args, shlex.split(flag)) for script in SCRIPTS]
+    wrong = [error(parser(script), shlex.split(flag)) for script in SCRIPTS]
     assert None in wrong, wrong
 
 
