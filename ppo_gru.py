@@ -1137,6 +1137,8 @@ def make_folder(args: Args, run: Run) -> None:
     except OSError as error:
         where = "run where the folder runs can be written"
         raise OSError(f"cannot make {run.folder} ({error.strerror}); {where}") from None
+    if not os.access(run.folder, os.W_OK):
+        raise OSError(f"--resume {run.folder}: this folder cannot be written")
     if args.capture_video:
         run.envs = LaneVideo(run.envs, str(run.folder / "videos"))
 
@@ -1339,9 +1341,10 @@ def load_checkpoint(run: Run, saved: dict[str, Any]) -> None:
         return
     load_state(run.envs, arrays["environments"])
     rollout.next_obs, rollout.next_ground_truth = arrays["next_obs"], arrays["next_ground_truth"]
-    device_of = {name: part.device for name, part in rollout.memory_state._asdict().items() if isinstance(part, Tensor)}
-    memory = {k: part.to(device_of[k]) if isinstance(part, Tensor) else part for k, part in state["memory"].items()}
-    rollout.memory_state = rollout.memory_state._replace(**memory)
+    memory, fresh = state["memory"], rollout.memory_state
+    for name, part in memory.items():
+        memory[name] = part.to(getattr(fresh, name).device) if isinstance(part, Tensor) else part
+    rollout.memory_state = fresh._replace(**memory)
 
 
 def convert(value: Any, kind: type, function: Callable) -> Any:
@@ -1443,8 +1446,8 @@ def stop_on_signals(run: Run) -> None:
         if run.signal:
             raise KeyboardInterrupt
         run.signal = number
-        if run.bar is not None:
-            tqdm.write("stopping at the end of this iteration; once more to stop at once", file=sys.stderr)
+        if run.bar is not None:  # print might be at work already, and cannot be entered twice
+            os.write(2, b"\nstopping at the end of this iteration; once more to stop at once\n")
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)

@@ -20,6 +20,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from types import ModuleType
+from typing import Any
 
 import torch
 import tyro
@@ -70,12 +72,19 @@ def bound_iteration(network: torch.nn.Module, args, device: torch.device, chunk:
     return iteration
 
 
+def one_iteration(script: ModuleType, args: Any, run: Any) -> None:
+    """Train for an iteration, the first of the run again."""
+    run.step = 0
+    script.train(args, run)
+
+
 def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, int]:
     """Return the steps/s of the script and of both bounds, the share of distinct pictures, and the best piece."""
     script = importlib.import_module(config.script)
     flags = ["--env-id", config.env_id, "--num-envs", str(config.num_envs), "--num-steps"]
     args = script.parse_args([*flags, str(num_steps), *config.flags])
     args.total_timesteps = config.num_envs * num_steps  # of one call of train
+    args.checkpoint_interval = 0
     short = replace(args, num_steps=32)
     run = script.setup(args)
     device = run.rollout.values.device
@@ -84,7 +93,7 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, in
     trials = {chunk: bound_iteration(cnn, short, device, chunk) for chunk in config.chunks}
     best = min(trials, key=lambda chunk: min(seconds(trials[chunk], device) for _ in range(3)))
     work = {
-        "script": partial(script.train, args, run),
+        "script": partial(one_iteration, script, args, run),
         "convolutions": bound_iteration(cnn, args, device, best),
         "encoder": bound_iteration(encoder, args, device, best),
     }

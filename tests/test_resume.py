@@ -290,6 +290,12 @@ def test_a_folder_without_a_checkpoint(tmp_path):
         ppo_gru.parse_args(["--resume", "nowhere"])
 
 
+def test_a_folder_that_cannot_be_written(trained, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: not (path == trained and mode == os.W_OK))
+    with pytest.raises(OSError, match=f"--resume {trained}: this folder cannot be written"):
+        resumed(ppo_gru, trained)
+
+
 def test_weights_alone_are_no_checkpoint(trained):
     torch.save(ppo_gru.read_model(trained / "checkpoint-128.pt") | {"processes": None}, trained / "checkpoint-128.pt")
     saved = ppo_gru.read_model(trained / "checkpoint-128.pt")
