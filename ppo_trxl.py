@@ -219,6 +219,8 @@ class Args:
     """longest episode that a learned encoding is made for"""
     trxl_segment_length: PositiveInt = 128
     """steps of one environment that the update attends from at once, and the pieces that minibatches are made of"""
+    trxl_memory_gradient: bool = False
+    """teach earlier steps of a segment what to leave for later ones: attend to their present inputs, with gradient"""
     trxl_init: Literal["xavier", "orthogonal", "kaiming", "tfixup"] = "xavier"
     """how the blocks' weights are initialized"""
     trxl_gate: Literal["none", "gru"] = "none"
@@ -700,7 +702,7 @@ class Memory(nn.Module):
             raise ValueError(f"--trxl-dim is {args.trxl_dim}; it must be even and a multiple of --trxl-num-heads")
         self.width, self.window = args.trxl_dim, args.trxl_memory_length
         self.segment_length, self.query_position = args.trxl_segment_length, args.trxl_query_position
-        self.encoding = args.trxl_positional_encoding
+        self.encoding, self.memory_gradient = args.trxl_positional_encoding, args.trxl_memory_gradient
         self.cache_dtype = torch.bfloat16 if args.amp else torch.float32  # as the layers deliver keys and values
         self.blocks = nn.ModuleList(Block(args) for _ in range(args.trxl_num_layers))
         for block in self.blocks:
@@ -794,6 +796,9 @@ class Memory(nn.Module):
             query, step 6            .  1  1           1  .  .
             query, step 0            .  .  .           .  .  .      an episode's first step sees nothing
             query, step 1            .  .  .           .  .  1
+
+        With --trxl-memory-gradient, the segment's own are the blocks' present inputs instead of the stored items: the
+        same numbers as long as the weights are, but with a gradient to earlier steps (Dai et al., 2019).
         """
         device, last_row = x.device, len(state.item_steps) - 1
         x = pieces.pad(x)  # (S, L, D)
@@ -801,7 +806,8 @@ class Memory(nn.Module):
         row, env = self.window + first // pieces.num_envs, first % pieces.num_envs  # (S, 1) of a segment's first step
         columns = pieces.columns()  # (L,)
         episode_step = state.item_steps[(row + columns).clamp(max=last_row), env].where(pieces.is_step(), 0)  # (S, L)
-        item_columns = torch.arange(-self.reach(episode_step), len(columns) - 1)  # (M,)
+        before = self.reach(episode_step)  # items from before the segment
+        item_columns = torch.arange(-before, len(columns) - 1)  # (M,)
         rows = (row + item_columns).clamp(max=last_row)  # (S, M)
         item_steps = state.item_steps[rows, env].to(device)  # (S, M)
         items = state.items[rows.to(device), env.to(device)]  # (S, M, K, D)
@@ -814,7 +820,11 @@ class Memory(nn.Module):
         position = self.position(item_steps, x.dtype)  # (S, M, D)
         query_encoding = self.query_encoding(episode_step, x.dtype)
         for k, block in enumerate(self.blocks):
-            keys_values = block.keys_values(items[:, :, k] + position)
+            block_items = items[:, :, k]
+            if self.memory_gradient:
+                own = x[:, :-1].masked_fill(~used[:, before:, None], 0.0)
+                block_items = torch.cat([block_items[:, :before], own], 1)
+            keys_values = block.keys_values(block_items + position)
             x = block(x, query_encoding if k == 0 else 0.0, keys_values, age, seen)
         return pieces.unpad(x)
 

@@ -24,6 +24,7 @@ TRANSFORMER = [
     {"script": ppo_trxl, "trxl_positional_encoding": "absolute"},
     {"script": ppo_trxl, "trxl_positional_encoding": "relative", "trxl_gate": "gru", "trxl_segment_length": 5},
     {"script": ppo_trxl, "trxl_positional_encoding": "learned", "trxl_memory_length": 40, "trxl_query_position": True},
+    {"script": ppo_trxl, "trxl_memory_gradient": True, "trxl_segment_length": 5},
 ]
 MEMORIES = [*RECURRENT, *TRANSFORMER, {"memory": "none"}]
 

@@ -43,15 +43,25 @@ def make_timeline(memory, seed=1):
     return fresh(memory)._replace(now=memory.window + STEPS, items=items, item_steps=steps)
 
 
-def naive(memory, x, row, lane, stored):
-    """One sample: gather its window, project it, attend with a softmax that is written out."""
+def naive(memory, x, row, lane, stored, own=None):
+    """One sample: gather its window, project it, attend with a softmax that is written out.
+
+    own: the blocks' inputs at the segment's earlier steps, which take the place of what is stored; this step's are
+    appended.
+    """
     step = int(stored.item_steps[row, lane])
     window = min(step, memory.window)
     at = torch.arange(row - window, row)
     told = memory.query_encoding(stored.item_steps[row, lane], x.dtype)
+    inputs = []
     for k, block in enumerate(memory.blocks):
         attention = block.attention
-        items = stored.items[at, lane, k] + memory.position(stored.item_steps[at, lane], x.dtype)
+        inputs.append(x)
+        items = stored.items[at, lane, k]
+        if own:
+            recent = torch.stack([each[k] for each in own])[-window or len(own) :]
+            items = torch.cat([items[: window - len(recent)], recent])
+        items = items + memory.position(stored.item_steps[at, lane], x.dtype)
         normed, query = block.norm_items(items), block.norm_query(x + (told if k == 0 else 0.0))
         heads, size = [], WIDTH // attention.heads
         for h in range(attention.heads):
@@ -66,6 +76,8 @@ def naive(memory, x, row, lane, stored):
         attended = attention.output(torch.cat(heads)) if window else torch.zeros_like(x)
         x = block.merge_attention(x, attended)
         x = block.merge_output(x, F.relu(block.projection(block.norm_output(x))))
+    if own is not None:
+        own.append(inputs)
     return x
 
 
@@ -95,6 +107,59 @@ def test_unroll_equals_a_window_gathered_for_every_sample(changes):
     gradients = [torch.autograd.grad((y * weight).sum(), inputs, allow_unused=True) for y in (found, wanted)]
     for got, want in zip(*gradients, strict=True):
         torch.testing.assert_close(got, want, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("changes", VARIANTS)
+def test_the_gradient_through_a_segment_equals_a_loop_s(changes):
+    """The loop takes one step after the other, and keeps what each block was given, with its gradient."""
+    memory = make_memory(trxl_memory_gradient=True, **changes)
+    stored = make_timeline(memory)
+    pieces = memory.cut(torch.zeros(STEPS, LANES, dtype=torch.bool))
+    pieces.length[2] = 3  # padding
+    flat = pieces.flat_index().tolist()
+    x = torch.randn(len(flat), WIDTH, dtype=torch.float64, requires_grad=True)
+    wanted, steps = [], iter(zip(x, flat, strict=True))
+    for length in pieces.length.tolist():
+        own = []
+        for each, at in itertools.islice(steps, length):
+            wanted.append(naive(memory, each, memory.window + at // LANES, at % LANES, stored, own))
+    wanted, found = torch.stack(wanted), memory.unroll(x, pieces, stored)
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-10)
+    weight = torch.randn_like(wanted)
+    gradients = [
+        torch.autograd.grad((y * weight).sum(), [x, *memory.parameters()], allow_unused=True) for y in (found, wanted)
+    ]
+    for got, want in zip(*gradients, strict=True):
+        torch.testing.assert_close(got, want, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("gate", ["none", "gru"])
+def test_how_far_the_gradient_reaches(gate):
+    """To the segment's first step, within the window of each block and the episode; not into what is stored."""
+    memory = make_memory(trxl_memory_gradient=True, trxl_gate=gate, trxl_memory_length=3)
+    stored = make_timeline(memory)
+    stored = stored._replace(items=stored.items.requires_grad_())
+    stored.item_steps[:] = torch.arange(100, 100 + len(stored.item_steps))[:, None]  # an episode that goes on
+    stored.item_steps[memory.window + 12 :, 1] -= 100 + memory.window + 12  # in environment 1 another begins at step 12
+    pieces = memory.cut(torch.zeros(STEPS, LANES, dtype=torch.bool))
+    x = torch.randn(STEPS * LANES, WIDTH, dtype=torch.float64, requires_grad=True)
+    y = memory.unroll(x, pieces, stored)
+    flat = pieces.flat_index()
+
+    def reached(t, lane):
+        """The steps that get gradient from the output at step t."""
+        (gradient,) = torch.autograd.grad(y[flat == t * LANES + lane].sum(), x, retain_graph=True)
+        touched = flat[gradient.abs().sum(1) > 0]
+        assert (touched % LANES == lane).all()
+        return sorted((touched // LANES).tolist())
+
+    assert reached(15, 0) == [9, 10, 11, 12, 13, 14, 15], "two blocks, each with a window of 3"
+    assert reached(11, 0) == [8, 9, 10, 11], "the segment of 8 steps begins at 8"
+    assert reached(14, 1) == [12, 13, 14], "another episode"
+    assert reached(12, 1) == [12]
+    plain = make_memory(trxl_gate=gate, trxl_memory_length=3)
+    y = plain.unroll(x, pieces, stored)
+    assert reached(15, 0) == [15]
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -196,8 +261,9 @@ def test_the_drawn_example():
 
 @pytest.mark.parametrize("fill", [1e6, math.nan])
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_what_is_not_seen_changes_nothing(encoding, fill):
-    memory = make_memory(trxl_positional_encoding=encoding)
+@pytest.mark.parametrize("gradient", [False, True])
+def test_what_is_not_seen_changes_nothing(encoding, fill, gradient):
+    memory = make_memory(trxl_positional_encoding=encoding, trxl_memory_gradient=gradient)
     stored = make_timeline(memory)
     pieces = memory.cut(torch.zeros(STEPS, LANES, dtype=torch.bool))
     x = torch.randn(STEPS * LANES, WIDTH, dtype=torch.float64)
