@@ -161,6 +161,8 @@ class Args:
     """discount factor"""
     gae_lambda: UnitInterval = 0.95
     """lambda of generalized advantage estimation"""
+    refresh_memory: bool = False
+    """before every epoch but the first, compute again what the rollout stored of the memory, with the present weights"""
     bootstrap_truncated: bool = False
     """value the final observation of an episode that a time limit cut short, instead of counting it as ended"""
     norm_adv: bool = False
@@ -544,8 +546,8 @@ class Decoder(nn.Sequential):
 # ---- 4 MEMORY ----
 # What the other sections use of a memory, whichever it is: Memory(args), an nn.Module of width D, and its MemoryState.
 # While acting: initial_state, begin_rollout, step (which also stores what the update needs), reset where an episode
-# ended. For the update: cut the rollout into pieces, and unroll pieces. And logs, numbers for TensorBoard.
-# A checkpoint holds the MemoryState, but for the fields named in `overwritten`.
+# ended. For the update: cut the rollout into pieces, and unroll pieces; rewind to the rollout's first step, to store all
+# again. And logs, numbers for TensorBoard. A checkpoint holds the MemoryState, but for the fields in `overwritten`.
 def visible(age: Tensor, episode_step: Tensor, window: int) -> Tensor:
     """Return whether a query at this step of its episode sees the item that was stored `age` steps before it.
 
@@ -737,6 +739,10 @@ class Memory(nn.Module):
             keys, values = block.keys_values(items[:, :, k] + position)
             state.keys[k][:, rows], state.values[k][:, rows] = keys.transpose(0, 1), values.transpose(0, 1)
         return state
+
+    def rewind(self, state: MemoryState) -> MemoryState:
+        """Return the state that the rollout began with; what it stored stays until it is stored again."""
+        return state._replace(now=self.window, episode_step=state.item_steps[self.window].clone())
 
     def step(self, x: Tensor, state: MemoryState) -> tuple[Tensor, MemoryState]:
         """Take one step of all environments: x (N, D) to (N, D), and the state after it. Stores the step's item.
@@ -1060,6 +1066,22 @@ def auxiliary_losses(
     return losses
 
 
+@torch.no_grad()
+def refresh_memory(agent: Agent, rollout: Rollout, args: Args) -> None:
+    """Store again, with the present weights, what the rollout stored of the memory (§7.1.4; Kapturowski et al., 2019).
+
+    What was stored before the rollout stays as it is. With the weights that acted, nothing changes, to the last bit.
+    """
+    done = (rollout.terminated | rollout.truncated).cpu()
+    with autocast(args, rollout.values.device):
+        state = agent.memory.begin_rollout(agent.memory.rewind(rollout.memory_state))
+        for t in range(len(done)):
+            x = agent.encoder({name: part[t] for name, part in rollout.obs.items()})
+            _, state = agent.memory.step(x, state)
+            state = agent.memory.reset(state, done[t])
+    rollout.memory_state = state
+
+
 def update(
     agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, ent_coef: float, args: Args
 ) -> dict[str, float]:
@@ -1074,7 +1096,9 @@ def update(
     for name, parameter in agent.named_parameters():
         (probe if args.ground_truth_detach and name.startswith("estimator.") else parameters).append(parameter)
     logs = []
-    for _ in range(args.update_epochs):
+    for epoch in range(args.update_epochs):
+        if args.refresh_memory and epoch > 0:
+            refresh_memory(agent, rollout, args)
         for minibatch in pieces.minibatches(args.num_minibatches):
             loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
             optimizer.zero_grad()

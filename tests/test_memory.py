@@ -368,3 +368,49 @@ def test_acting_and_learning_ask_no_device_for_numbers(played, monkeypatch, memo
             torch.nn.utils.clip_grad_norm_(agent.parameters(), 1.0)
             optimizer.step()
     assert all(parameter.grad.device.type == "meta" for parameter in agent.parameters())
+
+
+@pytest.mark.parametrize("env_id", ["CueRecall-v0", "Endless-MortarMayhem-v0"])
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_refreshing_with_the_weights_that_acted_changes_nothing(played, env_id, memory):
+    args, run, *_ = played(iterations=3, env_id=env_id, **memory)
+    before = [part.clone() if isinstance(part, torch.Tensor) else part for part in run.rollout.memory_state]
+    run.rollout.memory_state = run.rollout.memory_state._replace()
+    memory.get("script", ppo_gru).refresh_memory(run.agent, run.rollout, args)
+    for name, was, now in zip(run.rollout.memory_state._fields, before, run.rollout.memory_state, strict=True):
+        assert torch.equal(was, now) if isinstance(was, torch.Tensor) else was == now, name
+
+
+@pytest.mark.parametrize("memory", [each for each in MEMORIES if each.get("memory") != "none"])
+def test_a_refreshed_memory_is_that_of_a_rollout_with_the_present_weights(played, memory):
+    """The same observations and actions, played again from the same start by the changed agent."""
+    script = memory.get("script", ppo_gru)
+    args, run, *_ = played(iterations=3, weights_scale=3.0, env_id="CueRecall-v0", **memory)
+    rollout, agent = run.rollout, run.agent
+    state = rollout.memory_state
+    state = type(state)(*(part.clone() if isinstance(part, torch.Tensor) else part for part in state))
+    with torch.no_grad():
+        for parameter in agent.parameters():
+            parameter.mul_(0.9)
+    script.refresh_memory(agent, rollout, args)
+    _, ratio, values = recompute(run)
+    assert not torch.allclose(ratio, torch.ones(()), atol=1e-4), "the policy is another one"
+    # Steps one by one, from what was stored before the rollout.
+    with torch.no_grad():
+        state, wanted = agent.memory.begin_rollout(agent.memory.rewind(state)), []
+        for t in range(args.num_steps):
+            _, _, value, state = agent.act({name: part[t] for name, part in rollout.obs.items()}, state)
+            wanted.append(value)
+            state = agent.memory.reset(state, rollout.terminated[t] | rollout.truncated[t])
+    index, _, values = recompute(run)
+    torch.testing.assert_close(values, torch.stack(wanted).flatten()[index], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
+def test_memory_is_refreshed_before_every_epoch_but_the_first(tiny, script, monkeypatch):
+    calls, refresh_memory, ppo_loss = [], script.refresh_memory, script.ppo_loss
+    monkeypatch.setattr(script, "refresh_memory", lambda *given: calls.append("r") or refresh_memory(*given))
+    monkeypatch.setattr(script, "ppo_loss", lambda *given: calls.append("l") or ppo_loss(*given))
+    changes = {"env_id": "CueRecall-v0", "update_epochs": 3, "total_timesteps": 64}
+    script.main(tiny(script, refresh_memory=True, **changes))
+    assert "".join(calls) == "llrllrll"
