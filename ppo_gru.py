@@ -159,7 +159,7 @@ class Args:
     gae_lambda: UnitInterval = 0.95
     """lambda of generalized advantage estimation"""
     refresh_memory: bool = False
-    """before every epoch but the first, compute again what the rollout stored of the memory, with the present weights"""
+    """before every epoch but the first, compute again what the rollout stored of memory, with the present weights"""
     bootstrap_truncated: bool = False
     """value the final observation of an episode that a time limit cut short, instead of counting it as ended"""
     norm_adv: bool = False
@@ -517,8 +517,8 @@ class Decoder(nn.Sequential):
 # ---- 4 MEMORY ----
 # What the other sections use of a memory, whichever it is: Memory(args), an nn.Module of width D, and its MemoryState.
 # While acting: initial_state, begin_rollout, step (which also stores what the update needs), reset where an episode
-# ended. For the update: cut the rollout into pieces, and unroll pieces; rewind to the rollout's first step, to store all
-# again. And logs, numbers for TensorBoard. A checkpoint holds the MemoryState, but for the fields in `overwritten`.
+# ended. For the update: cut the rollout into pieces, and unroll pieces; rewind to the rollout's first step, to store
+# all again. And logs, numbers for TensorBoard. A checkpoint holds the MemoryState, but for the fields in `overwritten`.
 class MemoryState(NamedTuple):
     """What N environments remember. `t` and `hidden` are replaced step by step, `stored` is written in place."""
 
