@@ -266,7 +266,8 @@ def read_curve(run: EventAccumulator, name: str) -> tuple[np.ndarray, np.ndarray
     """
     levels = name.replace("eval/", "eval_levels/")
     if levels != name and levels in run.Tags()["tensors"]:
-        points = [(point.step, make_ndarray(point.tensor_proto)) for point in run.Tensors(levels)]
+        # Of steps that were done again after a resume, TensorBoard's reader keeps both tensors, unlike scalars.
+        points = {point.step: make_ndarray(point.tensor_proto) for point in run.Tensors(levels)}.items()
     else:
         points = [(point.step, [point.value]) for point in run.Scalars(name) if np.isfinite(point.value)]
     if not points:

@@ -35,8 +35,9 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, fields, replace
+from datetime import timedelta
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, TextIO, get_args, get_type_hints
 
 import gymnasium as gym
 import numpy as np
@@ -50,6 +51,11 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torch.nn.utils.rnn import pad_sequence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
+
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks
+    fcntl = None
 
 from memory_gym_envs.making import (
     LaneVideo,
@@ -114,12 +120,13 @@ class Args:
     load_model: str | None = None
     """start from the weights in this file, written by --save-model"""
     resume: str | None = None
-    """go on with the run in this folder from its last checkpoint; no other flag is needed, and no other value allowed,
-    but for a larger --total-timesteps"""
+    """go on with the run in this folder from its last checkpoint; other flags may only repeat the run's values, but
+    --total-timesteps may be larger"""
     checkpoint_interval: NonNegativeInt = 50
-    """iterations from one checkpoint to the next, and one when training ends or is stopped; two are kept (0: none)"""
+    """iterations between checkpoints; another one is written when training ends or is stopped, and the last two are
+    kept (0: no checkpoints)"""
     keep_models: NonNegativeInt = 0
-    """keep the weights of so many points of the training, evenly spaced, as model-STEP.pt"""
+    """keep the weights at so many evenly spaced points of the training, as model-STEP.pt"""
 
     env_id: str = "MortarMayhem-Grid-v0"
     """any Gymnasium id with Discrete or MultiDiscrete actions, with its module if that has to be imported first, e.g.
@@ -518,7 +525,7 @@ class Decoder(nn.Sequential):
 # What the other sections use of a memory, whichever it is: Memory(args), an nn.Module of width D, and its MemoryState.
 # While acting: initial_state, begin_rollout, step (which also stores what the update needs), reset where an episode
 # ended. For the update: cut the rollout into pieces, and unroll pieces; rewind to the rollout's first step, to store
-# all again. And logs, numbers for TensorBoard. A checkpoint holds the MemoryState, but for the fields in `overwritten`.
+# all again. And logs, numbers for TensorBoard. A checkpoint holds the MemoryState, but for the fields in `not_saved`.
 class MemoryState(NamedTuple):
     """What N environments remember. `t` and `hidden` are replaced step by step, `stored` is written in place."""
 
@@ -534,7 +541,7 @@ class Memory(nn.Module):
     for the LSTM, none without memory.
     """
 
-    overwritten = ("stored",)  # by every rollout before it is read: a checkpoint leaves it out
+    not_saved = ("stored",)  # in checkpoints: every rollout computes it before it is read
 
     def __init__(self, args: Args):
         super().__init__()
@@ -670,10 +677,14 @@ class MemoryLimit(ValueError):
     """An episode is longer than the memory allows; says which flag helps. `Memory.step` may raise it."""
 
 
+class RunError(RuntimeError):
+    """Training cannot go on, for a reason outside of it: a full disk, a process that is gone. Says which, in a line."""
+
+
 # ---- 6 TRAINING ----
 @dataclass
 class Rollout:
-    """T steps of N environments to learn from, and what the next rollout goes on with; overwritten by each one."""
+    """T steps of N environments to learn from, and what the next rollout goes on with; not_saved by each one."""
 
     obs: dict[str, Tensor]  # each (T, N, ...): uint8 pixels stay uint8
     actions: Tensor  # (T, N, A)
@@ -866,7 +877,7 @@ def update(
             logs.append(log)
         if args.target_kl is not None:
             kl = mean_log(logs[-args.num_minibatches :])["approx_kl"]
-            if np.mean(all_gather(kl)) > args.target_kl:  # section 8: all processes stop, or none
+            if np.mean(all_gather(kl)) > args.target_kl:  # section 8: so that all stop at the same epoch
                 break
 
     losses = mean_log(logs)
@@ -887,7 +898,7 @@ def mean_log(logs: list[dict[str, Tensor]]) -> dict[str, float]:
 def train(args: Args, run: "Run") -> None:
     """Train until --total-timesteps, rounded down to whole iterations, or until a signal.
 
-    Raises FloatingPointError if the training diverges, MemoryLimit as the memory does, OSError as `report` does.
+    Raises FloatingPointError if the training diverges, MemoryLimit as the memory does, RunError as `report` does.
     """
     agent, rollout, batch_size = run.agent, run.rollout, args.num_envs * args.num_steps
     for step in range(run.step, args.total_timesteps - batch_size + 1, batch_size):
@@ -996,8 +1007,9 @@ class Run:
     seconds: float = 0.0  # of training, without evaluations
     returns: deque = field(default_factory=lambda: deque(maxlen=100))  # of the last episodes, for the progress bar
     lengths: deque = field(default_factory=lambda: deque(maxlen=100))
-    signal: int = 0  # SIGTERM or SIGINT, if this process got one
-    stop: bool = False  # whether training ends after this iteration, since any process got one
+    received_signal: int = 0  # SIGTERM or SIGINT, if this process got one
+    stop: bool = False  # a process got one: this iteration is the last
+    lock: TextIO | None = None  # an open file, which tells others that the folder is in use
 
 
 def flag(name: str) -> str:
@@ -1075,11 +1087,11 @@ def setup(args: Args) -> Run:
     Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
     """
     if dist.is_torchelastic_launched() and not dist.is_initialized():  # by torchrun
-        dist.init_process_group()
-    check_args(args)
+        dist.init_process_group(timeout=timedelta(days=1))  # the others wait while the first one evaluates
     checkpoint = None if args.resume is None else read_checkpoint(args.resume)
     if checkpoint is not None:
         check_resumed(args, checkpoint)
+    check_args(args)
     run = make_run(args, 0 if checkpoint is None else checkpoint["step"])
     if args.load_model is not None and checkpoint is None:
         load_weights(run.agent, read_model(args.load_model), args.load_model)
@@ -1112,7 +1124,8 @@ def make_run(args: Args, step: int) -> Run:
     with enough_memory(args, device):
         mode = "debug_rgb_array" if args.capture_video else None
         share = args.num_envs // processes
-        seed = [args.seed, step] if step else args.seed  # what no checkpoint can restore begins with other levels
+        # Environments that cannot be restored must not repeat the episodes that the run began with.
+        seed = [args.seed, step] if step else args.seed
         envs = environments(args, share, seed=seed, first_lane=rank * share, options=options, render_mode=mode)
         obs, infos = envs.reset(options=options)
         agent = make_agent(envs, infos, args, device)
@@ -1121,7 +1134,7 @@ def make_run(args: Args, step: int) -> Run:
         )
         evaluates = args.eval_interval and rank == 0
         eval_envs = environments(args, len(evaluation_levels(args))) if evaluates else None
-    if rank > 0:  # the weights are those of every process, the actions are not
+    if rank > 0:  # all processes begin with the same weights, but sample actions of their own
         torch.manual_seed(int(np.random.SeedSequence([args.seed, rank]).generate_state(1)[0]))
     # As a tensor, the learning rate is set in place; the weight decay is torch's default.
     optimizer = torch.optim.AdamW(agent.parameters(), lr=torch.tensor(args.init_lr), weight_decay=0.01, fused=True)
@@ -1153,18 +1166,29 @@ def new_folder(args: Args) -> Path:
 
 
 def make_folder(args: Args, run: Run) -> None:
-    """Make the run folder, and what goes there from the first step on. Raises OSError, or as `start_tracking` does."""
+    """Make the run folder, or take over the one of --resume, and film if asked to.
+
+    Raises OSError if it cannot be written or is in use, or as `start_tracking` does.
+    """
+    if args.resume is not None and not os.access(run.folder, os.W_OK):
+        raise OSError(f"--resume {run.folder}: this folder cannot be written")
     if args.track:
-        start_tracking(args, run.folder.name)
+        start_tracking(args, run.folder.resolve().name)
     try:
         run.folder.mkdir(parents=True, exist_ok=args.resume is not None)
     except OSError as error:
         where = "run where the folder runs can be written"
         raise OSError(f"cannot make {run.folder} ({error.strerror}); {where}") from None
-    if not os.access(run.folder, os.W_OK):
-        raise OSError(f"--resume {run.folder}: this folder cannot be written")
+    run.lock = open(run.folder / ".lock", "w")  # noqa: SIM115 (until the run is closed)
+    if fcntl is not None:
+        try:
+            fcntl.flock(run.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise OSError(f"--resume {run.folder}: another process is training this run") from None
+    for part in run.folder.glob("*.part"):
+        part.unlink()  # of a process that was killed while it wrote
     if args.capture_video:
-        run.envs = LaneVideo(run.envs, str(run.folder / "videos"))
+        run.envs = LaneVideo(run.envs, str(run.folder / (f"videos-{run.step}" if run.step else "videos")))
 
 
 def open_logs(args: Args, run: Run) -> None:
@@ -1194,35 +1218,40 @@ def start_tracking(args: Args, name: str) -> None:
 
 
 def report(args: Args, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
-    """End an iteration: evaluate, write to TensorBoard, move the progress bar, save; each where it is due.
+    """End an iteration: evaluate, log, and save, each where it is due.
 
-    Raises OSError if a file cannot be written, FloatingPointError if a weight is not finite.
+    Raises RunError if a file cannot be written or a process is gone, FloatingPointError if a weight is not finite.
     """
-    batch_size = args.num_envs * args.num_steps
-    iteration, iterations = run.iteration, args.total_timesteps // batch_size
+    iteration, iterations = run.iteration, args.total_timesteps // (args.num_envs * args.num_steps)
     if run.eval_envs is not None and (iteration % args.eval_interval == 0 or iteration == iterations):
         for name, scores in level_scores(args, run).items():
             logs[f"eval/{name}"] = scores.mean().item()
             run.writer.add_tensor(f"eval_levels/{name}", scores, run.step)
-
-    logs, episodes, run.stop = combined(all_gather((logs, episodes, run.signal)))
-    run.seconds += logs["charts/seconds_iteration"]
-    run.returns.extend(episodes.get("charts/episodic_return", []))
-    run.lengths.extend(episodes.get("charts/episodic_length", []))
-    if run.writer is not None:
-        logs |= {name: float(np.mean(values)) for name, values in episodes.items()}
-        logs["charts/SPS"] = run.step / run.seconds
-        for name, value in logs.items():
-            run.writer.add_scalar(name, value, run.step)
-        last = {"return": run.returns, "length": run.lengths}
-        shown = {name: f"{np.mean(values):.2f}" for name, values in last.items() if values}
-        run.bar.set_postfix({**shown, "SPS": f"{logs['charts/SPS']:.0f}"}, refresh=False)
-        run.bar.update(batch_size)
-        if iteration * args.keep_models // iterations > (iteration - 1) * args.keep_models // iterations:
-            write_file(model_of(args, run), run.folder / f"model-{run.step}.pt")
+    logs, episodes, run.stop = combine_processes(all_gather((logs, episodes, run.received_signal)))
+    write_logs(args, run, logs, episodes)
+    if iteration * args.keep_models // iterations > (iteration - 1) * args.keep_models // iterations:
+        write_file(model_of(args, run), run.folder / f"model-{run.step}.pt")
     is_last = run.stop or iteration == iterations
     if args.checkpoint_interval and (iteration % args.checkpoint_interval == 0 or is_last):
         save_checkpoint(args, run)
+
+
+def write_logs(args: Args, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
+    """Write an iteration's numbers to TensorBoard and the progress bar; the first process does. Raises RunError."""
+    run.seconds += logs["charts/seconds_iteration"]
+    run.returns.extend(episodes.get("charts/episodic_return", []))
+    run.lengths.extend(episodes.get("charts/episodic_length", []))
+    if run.writer is None:
+        return
+    logs |= {name: float(np.mean(values)) for name, values in episodes.items()}
+    logs["charts/SPS"] = run.step / run.seconds
+    with writing_to(run.folder):
+        for name, value in logs.items():
+            run.writer.add_scalar(name, value, run.step)
+    last = {"return": run.returns, "length": run.lengths}
+    shown = {name: f"{np.mean(values):.2f}" for name, values in last.items() if values}
+    run.bar.set_postfix({**shown, "SPS": f"{logs['charts/SPS']:.0f}"}, refresh=False)
+    run.bar.update(args.num_envs * args.num_steps)
 
 
 def rank_and_size() -> tuple[int, int]:
@@ -1232,15 +1261,15 @@ def rank_and_size() -> tuple[int, int]:
 
 @contextlib.contextmanager
 def lost_process() -> Iterator[None]:
-    """Raise ConnectionError with one line for the user if another process does not answer."""
+    """Raise RunError if another process does not answer."""
     try:
         yield
     except RuntimeError as error:  # what Gloo and NCCL raise
-        raise ConnectionError("another process of this run has ended; its own output says why") from error
+        raise RunError("another process of this run has ended; its own output says why") from error
 
 
 def all_gather(value: Any) -> list[Any]:
-    """Return the value of every process, in the order of ranks. Raises ConnectionError if one has ended."""
+    """Return the value of every process, in the order of ranks. Raises RunError if one has ended."""
     values = [value] * rank_and_size()[1]
     if dist.is_initialized():
         with lost_process():
@@ -1251,21 +1280,21 @@ def all_gather(value: Any) -> list[Any]:
 def average_gradients(agent: Agent, num_steps: int) -> None:
     """Replace each gradient, a mean over num_steps here, by the mean over the steps of all processes.
 
-    Raises ConnectionError if one has ended.
+    Raises RunError if one has ended.
     """
     if not dist.is_initialized():
         return
-    gradients = [parameter.grad for parameter in agent.parameters()]
+    gradients = [parameter.grad for parameter in agent.parameters() if parameter.grad is not None]
     flat = parameters_to_vector([*gradients, gradients[0].new_ones(1)]) * num_steps
     with lost_process():
         dist.all_reduce(flat)
     vector_to_parameters(flat[:-1] / flat[-1], gradients)
 
 
-def combined(parts: list[tuple[dict, dict, int]]) -> tuple[dict[str, float], dict[str, list[float]], bool]:
+def combine_processes(parts: list[tuple[dict, dict, int]]) -> tuple[dict[str, float], dict[str, list[float]], bool]:
     """Combine what the processes found: the means of their logs, all episodes, and whether any got a signal.
 
-    The ratio's error is about the worst sample, so the largest one counts.
+    The ratio's error is a maximum over samples, and so over processes.
     """
     logs, episodes, signals = zip(*parts, strict=True)
     found = {name: [each[name] for each in logs if name in each] for name in logs[0]}
@@ -1283,28 +1312,42 @@ def model_of(args: Args, run: Run) -> dict[str, Any]:
     return saved | {"weights": run.agent.state_dict()}
 
 
-def write_file(saved: dict[str, Any], path: Path) -> None:
-    """Write a model or a checkpoint atomically: the file is whole, or it is not there.
+@contextlib.contextmanager
+def writing_to(path: Path) -> Iterator[None]:
+    """Raise RunError if what is inside cannot write."""
+    try:
+        yield
+    except OSError as error:
+        raise RunError(f"cannot write to {path} ({error.strerror})") from error
 
-    Raises FloatingPointError, and writes nothing, if a weight is not finite; OSError if it cannot be written.
+
+def write_file(saved: dict[str, Any], path: Path) -> None:
+    """Write a model or a checkpoint, in the first process, atomically: the file is whole, or it is not there.
+
+    Raises FloatingPointError, and writes nothing, if a weight is not finite; RunError if it cannot be written.
     """
+    if rank_and_size()[0] > 0:
+        return
     if not all(weight.isfinite().all() for weight in saved["weights"].values()):
         raise FloatingPointError(f"{path} is not written, since weights are not finite; try a lower --init-lr")
     part, content = Path(f"{path}.part"), io.BytesIO()
     torch.save(saved, content)
     try:
-        part.write_bytes(content.getbuffer())
-        flush_to_disk(part)
-        os.replace(part, path)
-    except OSError as error:
+        with writing_to(path):
+            part.write_bytes(content.getbuffer())
+            flush_to_disk(part)
+            os.replace(part, path)
+            flush_to_disk(path.parent)  # its new name
+    finally:
         part.unlink(missing_ok=True)
-        raise OSError(f"cannot write {path} ({error.strerror})") from None
 
 
 def flush_to_disk(path: Path) -> None:
-    """Have the system write the file to the disk, where even a power failure leaves it."""
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())
+    """Have the system write a file, or a folder's list of files, to the disk, where a power failure leaves it."""
+    if path.is_file() or os.name == "posix":
+        handle = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)
+        os.fsync(handle)
+        os.close(handle)
 
 
 def save_checkpoint(args: Args, run: Run) -> None:
@@ -1312,12 +1355,13 @@ def save_checkpoint(args: Args, run: Run) -> None:
     processes = all_gather(state_of_process(run))
     if run.writer is None:
         return
-    run.writer.flush()
-    for file in run.folder.glob("events.out.tfevents.*"):
-        flush_to_disk(file)  # a checkpoint means that the curves are there too
+    with writing_to(run.folder):
+        run.writer.flush()
+        for file in run.folder.glob("events.out.tfevents.*"):
+            flush_to_disk(file)  # a checkpoint means that the curves are there too
     run_state = {"seconds": run.seconds, "returns": list(run.returns), "lengths": list(run.lengths)}
     run_state["optimizer"] = run.optimizer.state_dict()
-    run_state["processes"] = convert(processes, np.ndarray, torch.from_numpy)  # plain files hold no arrays
+    run_state["processes"] = map_nested(processes, np.ndarray, torch.from_numpy)  # weights_only loads no arrays
     write_file(model_of(args, run) | run_state, run.folder / f"checkpoint-{run.step}.pt")
     for path in checkpoints_in(run.folder)[:-2]:
         path.unlink()
@@ -1325,13 +1369,13 @@ def save_checkpoint(args: Args, run: Run) -> None:
 
 def state_of_process(run: Run) -> dict[str, Any]:
     """Return what each process goes on with: environments, memory and generators, in arrays, tensors and numbers."""
-    rollout, overwritten = run.rollout, run.agent.memory.overwritten
+    rollout, not_saved = run.rollout, run.agent.memory.not_saved
     memory = rollout.memory_state._asdict()
     return {
         "environments": save_state(run.envs),
         "next_obs": rollout.next_obs,
         "next_ground_truth": rollout.next_ground_truth,
-        "memory": {name: part for name, part in memory.items() if name not in overwritten},
+        "memory": {name: part for name, part in memory.items() if name not in not_saved},
         "torch": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state(rollout.values.device) if rollout.values.is_cuda else None,
         "numpy": np.random.get_state(),  # noqa: NPY002 (it and Python's: environments of other packages may use them)
@@ -1357,7 +1401,7 @@ def load_checkpoint(run: Run, saved: dict[str, Any]) -> None:
     if state["cuda"] is not None and rollout.values.is_cuda:
         torch.cuda.set_rng_state(state["cuda"], rollout.values.device)
     names = ("environments", "next_obs", "next_ground_truth", "numpy")
-    arrays = convert({name: state[name] for name in names}, Tensor, Tensor.numpy)
+    arrays = map_nested({name: state[name] for name in names}, Tensor, Tensor.numpy)
     np.random.set_state(arrays["numpy"])  # noqa: NPY002
     if arrays["environments"] is None:
         if rank == 0:
@@ -1371,18 +1415,19 @@ def load_checkpoint(run: Run, saved: dict[str, Any]) -> None:
     rollout.memory_state = fresh._replace(**memory)
 
 
-def convert(value: Any, kind: type, function: Callable) -> Any:
+def map_nested(value: Any, kind: type, function: Callable) -> Any:
     """Apply a function to all values of a kind in nested dicts, lists and tuples."""
     if isinstance(value, dict):
-        return {name: convert(each, kind, function) for name, each in value.items()}
+        return {name: map_nested(each, kind, function) for name, each in value.items()}
     if isinstance(value, (list, tuple)):
-        return type(value)(convert(each, kind, function) for each in value)
+        return type(value)(map_nested(each, kind, function) for each in value)
     return function(value) if isinstance(value, kind) else value
 
 
 def checkpoints_in(folder: str | Path) -> list[Path]:
     """Return the checkpoints of a run, the latest last."""
-    return sorted(Path(folder).glob("checkpoint-*.pt"), key=lambda path: (len(path.name), path.name))
+    found = {int(path.stem[11:]): path for path in Path(folder).glob("checkpoint-*.pt") if path.stem[11:].isdecimal()}
+    return [found[step] for step in sorted(found)]
 
 
 def read_checkpoint(folder: str | Path) -> dict[str, Any]:
@@ -1464,51 +1509,55 @@ def load_weights(agent: Agent, saved: dict[str, Any], path: str | Path) -> None:
 
 
 def stop_on_signals(run: Run) -> None:
-    """Have SIGINT (Ctrl-C) and SIGTERM end the training after the present iteration; a second one ends it at once."""
+    """Have SIGINT (Ctrl-C) and SIGTERM end the training after the present iteration, a second Ctrl-C at once.
+
+    A second SIGTERM does not: torchrun passes on the one that a cluster has sent to all processes.
+    """
 
     def stop(number: int, _: Any) -> None:
-        if run.signal:
+        if run.received_signal and number == signal.SIGINT and not dist.is_initialized():
             raise KeyboardInterrupt
-        run.signal = number
-        if run.bar is not None:  # print might be at work already, and cannot be entered twice
-            os.write(2, b"\nstopping at the end of this iteration; once more to stop at once\n")
+        if not run.received_signal and run.bar is not None:  # by no print, which might be at work already
+            os.write(2, b"\nstopping at the end of this iteration; Ctrl-C stops at once, without a checkpoint\n")
+        run.received_signal = number
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
 
 
-def close(args: Args, run: Run) -> None:
-    """Save what was learned, if asked to, and close all files. Raises what `write_file` raises."""
-    try:
-        if args.save_model and run.writer is not None:
-            write_file(model_of(args, run), run.folder / "model.pt")
-    finally:
-        with contextlib.suppress(OSError):  # where the writer cannot write, it has said so before
-            for each in filter(None, (run.bar, run.envs, run.eval_envs, run.writer)):
-                each.close()
-        if dist.is_initialized():
-            dist.destroy_process_group()
+def close(run: Run) -> None:
+    """Close all files, environments and connections."""
+    for each in filter(None, (run.bar, run.envs, run.eval_envs, run.writer, run.lock)):
+        with contextlib.suppress(OSError):  # a writer that cannot write has said so before
+            each.close()
+    if dist.is_initialized():
+        dist.destroy_process_group()
 
 
 def run_to_end(args: Args, run: Run) -> Path:
-    """Train until it is done or stopped; return the run folder. Raises what `train` and `close` raise.
+    """Train until it is done or stopped; return the run folder. Raises what `train` and `write_file` raise.
 
-    With --save-model, what was learned is kept, whatever ends the training, but for one that diverged.
+    With --save-model, what was learned is kept, unless the training diverged or the disk is full.
     """
+    save_model = args.save_model
     try:
         train(args, run)
         if run.writer is not None:
-            run.writer.flush()
+            with writing_to(run.folder):
+                run.writer.flush()
     except KeyboardInterrupt:
         pass
-    except (FloatingPointError, OSError) as error:
-        args = replace(args, save_model=False)
-        reason = f"cannot write to {run.folder} ({error.strerror})" if getattr(error, "errno", None) else error
+    except (FloatingPointError, RunError, MemoryLimit) as error:
+        save_model = save_model and isinstance(error, MemoryLimit)
         found = checkpoints_in(run.folder)
         last = f"the last checkpoint is {found[-1]}" if found else "there is no checkpoint yet"
-        raise type(error)(f"iteration {run.iteration}: {reason}; {last}") from error
+        raise type(error)(f"iteration {run.iteration}: {error}; {last}") from error
     finally:
-        close(args, run)
+        try:
+            if save_model:
+                write_file(model_of(args, run), run.folder / "model.pt")
+        finally:
+            close(run)
     return run.folder
 
 
@@ -1649,7 +1698,7 @@ class GRUScan(torch.autograd.Function):
     def forward(ctx, inputs: Tensor, first: Tensor, weight: Tensor, bias: Tensor, sizes: list[int]) -> Tensor:
         """Run the recurrence, keeping every gate for the backward pass."""
         width = first.shape[1]
-        gates = inputs.clone()  # (B, 3D) the projected inputs, step by step overwritten with r, z and n
+        gates = inputs.clone()  # (B, 3D) the projected inputs, step by step not_saved with r, z and n
         states, before, candidates = (inputs.new_empty(len(inputs), width) for _ in range(3))  # (B, D) each
         transposed, state = weight.T.contiguous(), first
         steps = zip(*(each.split(sizes) for each in (gates, before, candidates, states)), strict=True)
@@ -1698,12 +1747,13 @@ if __name__ == "__main__":
     try:
         args = parse_args(sys.argv[1:])
         run = setup(args)
-    except (ValueError, OSError, ImportError, gym.error.Error) as error:
+    except (ValueError, OSError, ImportError, gym.error.Error, RunError) as error:
         sys.exit(f"{Path(__file__).name}: {' '.join(str(error).split())}")
     stop_on_signals(run)
-    threading.excepthook = lambda _: None  # what TensorBoard's thread cannot write, its next call raises here
+    # What TensorBoard's thread cannot write, its next call raises in this one.
+    threading.excepthook = lambda it: None if "tensorboard" in repr(type(it.thread)) else threading.__excepthook__(it)
     try:
         run_to_end(args, run)
-    except (MemoryLimit, FloatingPointError, OSError) as error:
+    except (MemoryLimit, FloatingPointError, RunError) as error:
         sys.exit(f"{Path(__file__).name}: {' '.join(str(error).split())}")
-    sys.exit(128 + run.signal if run.signal else 0)
+    sys.exit(128 + run.received_signal if run.received_signal else 0)

@@ -81,17 +81,17 @@ def comes_to_its_end(script: str, flags: list[str], seconds: float | None) -> bo
     return True
 
 
-def scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
-    """Return what a run has logged, (step, value) by name, but for what a clock measures."""
+def scalars(folder: Path) -> dict[str, list]:
+    """Return the curves of a run, of each level where it was evaluated, but for what a clock measures."""
     run = evaluate.read_run(str(folder))
     names = [name for name in run.Tags()["scalars"] if not name.startswith(("charts/SPS", "charts/seconds"))]
-    return {name: [(point.step, point.value) for point in run.Scalars(name)] for name in names}
+    return {name: [array.tolist() for array in evaluate.read_curve(run, name)] for name in names}
 
 
 def kill(config: Config) -> None:
     """Kill so many times, and print the count. Raises RuntimeError if a run does not resume, or gives other scalars."""
     moments, wanted = random.Random(config.seed), None
-    count = {"kills": 0, "before the first checkpoint": 0, "while a checkpoint was written": 0, "runs": 0}
+    count = {"kills": 0, "before the first checkpoint": 0, "while a file was written": 0, "runs": 0}
     while count["kills"] < config.kills or wanted is None:
         name = f"run-{count['runs']}-{count['kills']}"
         flags, folder = arguments(config.iterations, name), None
@@ -104,7 +104,7 @@ def kill(config: Config) -> None:
             if folder is None or not list(folder.glob("checkpoint-*.pt")):
                 count["before the first checkpoint"] += 1
                 break
-            count["while a checkpoint was written"] += bool(list(folder.glob("*.part")))
+            count["while a file was written"] += bool(list(folder.glob("*.part")))
             flags = ["--resume", str(folder)]
             time.sleep(1)  # TensorBoard sorts files by the second they begin in
         else:
@@ -130,7 +130,7 @@ def soak(config: Config) -> None:
         args.total_timesteps += batch_size
         resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
         rows.append((resident, len(os.listdir("/proc/self/fd")), batch_size / (time.perf_counter() - began)))
-    script.close(args, run)
+    script.close(run)
     print(f"\n{config.script}, a checkpoint after each of {config.soak} iterations\n")
     print("| iterations | resident memory, MiB | open files | steps per second |\n|---|---:|---:|---:|")
     for part in np.array_split(np.arange(config.soak), 5):
@@ -155,7 +155,7 @@ def cost(config: Config) -> None:
             script.save_checkpoint(args, run)
             seconds.append(time.perf_counter() - began)
         size = script.checkpoints_in(run.folder)[-1].stat().st_size / 2**20
-        script.close(args, run)
+        script.close(run)
         taken = float(np.median(seconds))
         share = taken / (args.checkpoint_interval * run.seconds)
         shape = f"{args.num_envs} x {args.num_steps}"

@@ -104,7 +104,7 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, in
     for _ in range(config.rounds):
         for name, iteration in work.items():
             times[name].append(seconds(iteration, device))
-    script.close(args, run)
+    script.close(run)
     steps = config.num_envs * num_steps
     distinct = sum(encoded) / (config.rounds * args.update_epochs * steps)
     return {name: steps / statistics.median(taken) for name, taken in times.items()}, distinct, best

@@ -58,7 +58,8 @@ def curves():
         for name in tags["tensors"]:
             if name.startswith("eval_levels/"):
                 points = events.Tensors(name)
-                found[name] = [(point.step, make_ndarray(point.tensor_proto).tolist()) for point in points]
+                last = {point.step: make_ndarray(point.tensor_proto).tolist() for point in points}
+                found[name] = list(last.items())  # of tensors that were logged twice, the reader keeps both
         return found
 
     return read

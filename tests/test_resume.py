@@ -77,7 +77,7 @@ def interrupted(monkeypatch, script, args, iteration):
         finally:
             for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
                 signal.signal(number, handler)
-    assert run.signal == signal.SIGTERM
+    assert run.received_signal == signal.SIGTERM
     assert run.step == iteration * args.num_envs * args.num_steps
     return run.folder
 
@@ -116,8 +116,9 @@ def test_a_longer_training_goes_on_where_the_shorter_one_ended(tiny, curves, scr
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_what_was_played_twice_is_logged_once(tiny, curves, monkeypatch, script):
-    """A crash two iterations after the checkpoint: these are played again."""
-    args = tiny(script, **GRID, total_timesteps=6 * 64, checkpoint_interval=2, keep_models=6)
+    """A crash after the checkpoint: an iteration and its evaluation are done again."""
+    few = {"eval_interval": 1, "eval_levels": 2, "eval_repeats": 1, "keep_models": 6}
+    args = tiny(script, **GRID, total_timesteps=6 * 64, checkpoint_interval=2, **few)
     whole = curves(script.main(args))
     with monkeypatch.context() as patch:
         updates, update = [], script.update
@@ -135,8 +136,29 @@ def test_what_was_played_twice_is_logged_once(tiny, curves, monkeypatch, script)
     assert curves(run.folder)["losses/loss"] == whole["losses/loss"][:3]
     assert resumed(script, run.folder) == run.folder
     assert curves(run.folder) == whole
+    steps, scores = evaluate.read_curve(evaluate.read_run(str(run.folder)), "eval/return")
+    assert steps.tolist() == [64, 128, 192, 256, 320, 384]
+    assert scores.shape == (6, 2), "each level's"
     found = sorted(int(path.stem.partition("-")[2]) for path in run.folder.glob("model-*.pt"))
     assert found == [64, 128, 192, 256, 320, 384]
+
+
+def test_copies_of_a_checkpoint_are_left_alone(tiny):
+    folder = ppo_gru.main(tiny(**GRID))
+    for name in ("checkpoint-128-good.pt", "checkpoint-128 (copy).pt", "checkpoint-best.pt"):
+        (folder / name).write_bytes((folder / "checkpoint-128.pt").read_bytes())
+    resumed(ppo_gru, folder, "--total-timesteps", "512")
+    assert ppo_gru.read_checkpoint(folder)["step"] == 512
+    assert len(list(folder.glob("checkpoint-128*"))) == 3
+
+
+def test_a_run_that_is_being_trained(tiny):
+    run = ppo_gru.setup(tiny(**GRID, total_timesteps=256, checkpoint_interval=1))
+    ppo_gru.train(tiny(**GRID, checkpoint_interval=1), run)
+    with pytest.raises(OSError, match=r"--resume .*: another process is training this run"):
+        ppo_gru.setup(ppo_gru.parse_args(["--resume", str(run.folder)]))
+    ppo_gru.close(run)
+    assert resumed(ppo_gru, run.folder) == run.folder
 
 
 def test_which_files_are_kept(tiny):
@@ -187,20 +209,22 @@ def test_videos_go_on(tiny, monkeypatch):
     whole = ppo_gru.main(args)
     folder = interrupted(monkeypatch, ppo_gru, args, 2)
     resumed(ppo_gru, folder)
-    names = [sorted(path.name for path in (each / "videos").glob("*.mp4")) for each in (whole, folder)]
+    names = [sorted(path.name for path in each.glob("videos*/*.mp4")) for each in (whole, folder)]
     assert names[0] == names[1]
     assert len(names[0]) > 2
+    assert list(folder.glob("videos-128/*.mp4")), "what is there already is never written over"
 
 
-def test_the_second_signal_ends_the_training_at_once(tiny, monkeypatch):
+def test_a_second_interrupt_ends_the_training_at_once(tiny, monkeypatch):
     run = ppo_gru.setup(tiny(**GRID))
     handlers = {}
     monkeypatch.setattr(ppo_gru.signal, "signal", handlers.__setitem__)
     ppo_gru.stop_on_signals(run)
-    handlers[signal.SIGINT](signal.SIGINT, None)
-    assert run.signal == signal.SIGINT
+    handlers[signal.SIGTERM](signal.SIGTERM, None)
+    handlers[signal.SIGTERM](signal.SIGTERM, None)  # whoever sends it twice does not mean more by it
+    assert run.received_signal == signal.SIGTERM
     with pytest.raises(KeyboardInterrupt):
-        handlers[signal.SIGTERM](signal.SIGTERM, None)
+        handlers[signal.SIGINT](signal.SIGINT, None)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -267,7 +291,7 @@ def test_flags_that_repeat_the_run_s_are_no_contradiction(trained):
 
 def test_another_script_s_run(trained):
     with pytest.raises(ValueError, match=r"this run is ppo_gru\.py's, not ppo_trxl\.py's"):
-        ppo_trxl.setup(ppo_trxl.Args(resume=str(trained)))
+        ppo_trxl.setup(ppo_trxl.parse_args(["--resume", str(trained), "--num-minibatches", "1000"]))
 
 
 def test_a_checkpoint_that_is_cut_short(trained, tmp_path):
@@ -362,7 +386,7 @@ def test_no_room_for_a_checkpoint(curves):
     kept = (folder / "checkpoint-160.pt").read_bytes()
     line = limited(len(kept) // 2, "--resume", str(folder), "--total-timesteps", "480")
     said = (
-        rf"ppo_gru\.py: iteration 20: cannot write {folder}/checkpoint-320\.pt \(File too large\); "
+        rf"ppo_gru\.py: iteration 20: cannot write to {folder}/checkpoint-320\.pt \(File too large\); "
         rf"the last checkpoint is {folder}/checkpoint-160\.pt"
     )
     assert re.fullmatch(said, line), line
