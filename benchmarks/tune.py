@@ -30,8 +30,10 @@ quarter: the pruner compares with completed trials only, and these are the bette
 The tasks take --steps-scale 0.3 of their usual steps, 0.6 to 0.9 million: wanted is what learns a task in less than a
 third of the time that benchmarks/learning.py gives. Learning rate and entropy bonus decay over these steps, so that the
 end of a training shows what a small learning rate does. As in the thesis (6.1.1), a trial is not repeated with other
-seeds: the tasks are its repetitions. Of many noisy scores the best one is mostly a lucky one; train the best settings
-again with other seeds.
+seeds: the tasks are its repetitions. But the best of many noisy scores is partly luck. This trains the preset and the
+best five of the search again with other seeds, for as many steps as benchmarks/learning.py does, and prunes none:
+
+    python benchmarks/tune.py --again tune --folder tune-again --trials 6 --seeds 2 3 4 --steps-scale 1 --keep 100
 
 Shape letter: S slices of a training.
 """
@@ -39,6 +41,7 @@ Shape letter: S slices of a training.
 import contextlib
 import fcntl
 import io
+import itertools
 import json
 import math
 import multiprocessing
@@ -67,6 +70,7 @@ try:
     from matplotlib import color_sequences
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullLocator
     from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, distribution_to_json
     from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
     from optuna.storages.journal import JournalFileBackend, JournalStorage
@@ -121,6 +125,7 @@ WARM_UP = SLICES // 4  # slices before a trial may be pruned
 UNPRUNED_TRIALS = 8  # complete trials before the first may be pruned
 COMMANDS = 20  # that count as a score of 1 in the endless task
 SHOWN = 5  # of the best trials
+PRESET = "preset"  # the name of the trial with the preset's settings
 FEW = 10  # complete trials, with fewer of which no importances are told
 
 
@@ -140,14 +145,16 @@ class Config:
     """of those that benchmarks/learning.py knows"""
     steps_scale: float = 0.3
     """share of a task's steps that a trial trains for"""
-    seeds: int = 1
-    """trainings on each task in a trial"""
+    seeds: tuple[int, ...] = (1,)
+    """a trial trains with each of them on each task"""
     keep: float = 50.0
     """percent of the trials that the pruner keeps"""
     sampler_seed: int = 1
     """seed of what the search draws"""
     folder: Path = Path("tune")
     """where the search is kept"""
+    again: Path | None = None
+    """folder of another search; its best five are the first trials of a new one, after the preset"""
     report: bool = False
     """search no further, report what was found"""
     out: Path | None = None
@@ -272,13 +279,13 @@ def iteration(script: ModuleType, args: Any, run: Any, step: int, metric: str) -
 
 def run_trial(trial: optuna.Trial, config: Config) -> float | None:
     """Train on all tasks in turns, slice by slice; return the trial's score, or None if it was pruned."""
-    began, names = time.monotonic(), [name for name in config.tasks for _ in range(config.seeds)]
+    began, trainings = time.monotonic(), []
     with contextlib.ExitStack() as stack:
-        trainings = []
-        for i, name in enumerate(names):
-            args = arguments(config, TASKS[name], trial.params, i % config.seeds + 1, f"trial-{trial.number}")
-            trainings.append(stack.enter_context(contextlib.closing(slices(SCRIPTS[config.script], args, TASKS[name]))))
-        curves = np.empty((len(names), 0))
+        for task, seed in itertools.product([TASKS[name] for name in config.tasks], config.seeds):
+            args = arguments(config, task, trial.params, seed, f"trial-{trial.number}")
+            training = slices(SCRIPTS[config.script], args, task)
+            trainings.append(stack.enter_context(contextlib.closing(training)))
+        curves = np.empty((len(trainings), 0))
         while curves.shape[1] < SLICES:
             curves = np.column_stack([curves, [next(training) for training in trainings]])
             trial.report(secured(curves), curves.shape[1] - 1)
@@ -321,7 +328,7 @@ def open_study(config: Config) -> optuna.Study:
     Raises ValueError if the folder holds a search whose scores do not compare.
     """
     (config.folder / "locks").mkdir(parents=True, exist_ok=True)
-    pruner = optuna.pruners.PercentilePruner(config.keep, UNPRUNED_TRIALS, WARM_UP)
+    pruner = optuna.pruners.PercentilePruner(config.keep, UNPRUNED_TRIALS, WARM_UP - 1)
     wanted = {
         "--steps-scale": config.steps_scale,
         "--seeds": config.seeds,
@@ -335,12 +342,21 @@ def open_study(config: Config) -> optuna.Study:
         )
         if not study.user_attrs:
             study.set_user_attr("search", wanted)
-            study.enqueue_trial(preset_params(config.script), user_attrs={"name": "preset"})
+            queue_first_trials(study, config)
         found = study.user_attrs["search"]
         if differ := [name for name in wanted if found[name] != wanted[name]]:
             raise ValueError(f"{config.folder} holds a search with another {differ[0]}; use another --folder")
         queue_killed_trials(study, config)
     return study
+
+
+def queue_first_trials(study: optuna.Study, config: Config) -> None:
+    """Queue the preset, and the best trials of another search with --again; raise ValueError as `best_trials` does."""
+    study.enqueue_trial(preset_params(config.script), user_attrs={"name": PRESET})
+    if config.again is not None:
+        found = best_trials(load_study(replace(config, folder=config.again)))
+        for trial in [each for each in found if name_of(each) != PRESET][:SHOWN]:
+            study.enqueue_trial(trial.params, user_attrs={"name": f"{name_of(trial)} of {config.again.name}"})
 
 
 def journal(config: Config) -> Path:
@@ -439,9 +455,18 @@ def search(config: Config) -> None:
 
 
 # ---- REPORT ----
+def load_study(config: Config) -> optuna.Study:
+    """Open a search that was begun earlier; raise ValueError if there is none."""
+    if not journal(config).is_file():
+        raise ValueError(f"there is no search of {config.script} in {config.folder}")
+    return optuna.load_study(study_name=config.script, storage=storage(config))
+
+
 def best_trials(study: optuna.Study) -> list[FrozenTrial]:
-    """Return the complete trials, the best one first."""
+    """Return the complete trials, the best one first; raise ValueError if there are none."""
     complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    if not complete:
+        raise ValueError(f"no trial of {study.study_name} is complete yet")
     return sorted(complete, key=lambda trial: -trial.value)
 
 
@@ -458,7 +483,7 @@ def importances(study: optuna.Study, complete: list[FrozenTrial]) -> dict[str, f
 
 
 def name_of(trial: FrozenTrial) -> str:
-    """Return what a trial is called: its number, unless it is the preset."""
+    """Return what a trial is called: its number, unless its settings were given."""
     return trial.user_attrs.get("name", f"trial {trial.number}")
 
 
@@ -490,12 +515,8 @@ def flags_of(params: dict[str, Any]) -> str:
 
 def report(config: Config) -> None:
     """Print tables and draw the picture. Raises ValueError if there is nothing to report yet."""
-    if not journal(config).is_file():
-        raise ValueError(f"there is no search of {config.script} in {config.folder}")
-    study = optuna.load_study(study_name=config.script, storage=storage(config))
+    study = load_study(config)
     complete = best_trials(study)
-    if not complete:
-        raise ValueError(f"no trial in {config.folder} is complete yet")
     states = [trial.state for trial in study.get_trials(deepcopy=False)]
     told = ", ".join(f"{states.count(state)} {state.name.lower()}" for state in dict.fromkeys(states))
     shown = [*complete[:SHOWN], *(trial for trial in complete[SHOWN:] if "name" in trial.user_attrs)]
@@ -513,7 +534,7 @@ def report(config: Config) -> None:
 
 def draw(study: optuna.Study, names: list[str], out: Path) -> None:
     """Draw the scores in the order of the trials, and against these parameters, to OUT.png."""
-    figure = Figure(figsize=(16, 4), layout="constrained")
+    figure = Figure(figsize=(15, 4), layout="constrained")
     order, *others = figure.subplots(1, 1 + len(names), width_ratios=[1.6, *[1] * len(names)])
     complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     pruned = study.get_trials(deepcopy=False, states=(TrialState.PRUNED,))
@@ -523,9 +544,8 @@ def draw(study: optuna.Study, names: list[str], out: Path) -> None:
     order.step(numbers, np.maximum.accumulate(values), color=best, where="post", label="best so far")
     late = [max(trial.intermediate_values.values()) for trial in pruned]
     order.plot([trial.number for trial in pruned], late, "x", color=cross, label="pruned: what it had secured")
-    for trial in complete:
-        if "name" in trial.user_attrs:
-            order.axhline(trial.value, color=line, linestyle="--", label=name_of(trial))
+    for preset in (trial.value for trial in complete if name_of(trial) == PRESET):
+        order.axhline(preset, color=line, linestyle="--", label=PRESET)
     order.set(xlabel="trial", ylabel="score", title=f"{study.study_name}: scores of the trials")
     order.legend(fontsize="small")
     for axis, name in zip(others, names, strict=True):
@@ -544,17 +564,20 @@ def draw_parameter(axis: Axes, name: str, complete: list[FrozenTrial]) -> None:
         shift = np.random.default_rng(0).uniform(-0.15, 0.15, len(values))
         values = [kind.choices.index(value) for value in values] + shift
         axis.set_xticks(range(len(kind.choices)), [str(choice) for choice in kind.choices])
-    elif kind.log:
-        axis.set_xscale("log")
+    else:
+        axis.set(xscale="log", xlim=(kind.low / 1.1, kind.high * 1.1))
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_locator(NullLocator())
     numbers, scores = [trial.number for trial in complete], [trial.value for trial in complete]
     axis.scatter(values, scores, c=numbers, cmap="Blues", edgecolors="gray", vmin=-max(numbers))
-    axis.set(xlabel=name, title=name)
+    axis.set(xlabel=f"{name} (later trials are darker)")
 
 
 # ---- COMMAND LINE ----
 def check(config: Config) -> None:
     """Raise ValueError, naming the flag, for the first value that cannot work."""
-    for name in ("trials", "jobs", "seeds"):
+    for name in ("trials", "jobs"):
         if getattr(config, name) < 1:
             raise ValueError(f"{flag(name)} is {getattr(config, name)}; it must be 1 or more")
     for name in ("hours", "steps_scale"):
@@ -562,12 +585,13 @@ def check(config: Config) -> None:
             raise ValueError(f"{flag(name)} is {getattr(config, name)}; it must be above 0")
     if not 0 < config.keep <= 100:
         raise ValueError(f"--keep is {config.keep}; it must be above 0, up to 100")
-    if config.sampler_seed < 0:
-        raise ValueError(f"--sampler-seed is {config.sampler_seed}; it must be 0 or more")
+    if min(config.sampler_seed, *config.seeds) < 0:
+        raise ValueError("--sampler-seed and --seeds must be 0 or more")
     if unknown := [name for name in config.tasks if name not in TASKS]:
         raise ValueError(f"there is no task {unknown[0]}; there are {', '.join(TASKS)}")
-    if len(set(config.tasks)) < max(1, len(config.tasks)):
-        raise ValueError("--tasks needs one task or more, each of them once")
+    for name in ("tasks", "seeds"):
+        if len(set(getattr(config, name))) < max(1, len(getattr(config, name))):
+            raise ValueError(f"{flag(name)} needs one or more, each of them once")
     batch_size = max(math.prod(map(int, layout.split("x"))) for layout in SPACE["layout"].choices)
     fewest = min(TASKS[name].total_timesteps for name in config.tasks)
     if fewest * config.steps_scale < batch_size:

@@ -189,7 +189,7 @@ def test_a_search_finds_what_is_better_and_prunes_what_is_worse(quick, capsys):
     assert states.count(TrialState.COMPLETE) + states.count(TrialState.PRUNED) == 24
     pruned = [trial for trial in trials if trial.state == TrialState.PRUNED]
     assert pruned
-    assert all(tune.WARM_UP < len(trial.user_attrs["curves"][0]) < tune.SLICES for trial in pruned)
+    assert all(tune.WARM_UP <= len(trial.user_attrs["curves"][0]) < tune.SLICES for trial in pruned)
     best = max((trial for trial in trials if trial.state == TrialState.COMPLETE), key=lambda trial: trial.value)
     assert best.params["init_lr"] > 2e-3
     text = capsys.readouterr().out
@@ -229,9 +229,24 @@ def test_ctrl_c_leaves_the_trial_for_the_next_start(quick, monkeypatch, capsys):
 def test_hours_and_seeds(quick):
     tune.search(replace(quick, hours=1e-9))
     assert [trial.state for trial in trials_of(quick)] == [TrialState.WAITING]
-    config = replace(quick, folder=quick.folder / "seeds", seeds=2)
+    config = replace(quick, folder=quick.folder / "seeds", seeds=(1, 2))
     tune.search(config)
     assert np.shape(trials_of(config)[0].user_attrs["curves"]) == (2 * len(config.tasks), tune.SLICES)
+
+
+def test_again(quick, capsys):
+    tune.search(replace(quick, trials=8))
+    best = tune.best_trials(tune.load_study(quick))[:5]
+    config = replace(quick, trials=6, folder=quick.folder / "again", again=quick.folder, seeds=(2, 3))
+    tune.main(config)
+    trials = trials_of(config)
+    assert len(trials) == 6
+    assert trials[0].params == tune.preset_params("ppo_gru")
+    numbers = [trial.number for trial in best if trial.number]
+    assert [trial.params["init_lr"] for trial in trials[1 : 1 + len(numbers)]] == [
+        trial.params["init_lr"] for trial in best if trial.number
+    ]
+    assert f"| trial {numbers[0]} of search |" in capsys.readouterr().out
 
 
 def test_draws_differ_from_trial_to_trial_and_from_worker_to_worker(quick):
@@ -250,9 +265,11 @@ def test_draws_differ_from_trial_to_trial_and_from_worker_to_worker(quick):
         ({"hours": -1.0}, "--hours is -1.0; it must be above 0"),
         ({"steps_scale": 0.001}, "--steps-scale is 0.001; it must be 0.0041 or more"),
         ({"keep": 0.0}, "--keep is 0.0"),
-        ({"sampler_seed": -1}, "--sampler-seed is -1"),
+        ({"sampler_seed": -1}, "--sampler-seed and --seeds must be 0 or more"),
+        ({"seeds": (1, -1)}, "--sampler-seed and --seeds must be 0 or more"),
+        ({"seeds": (1, 1)}, "--seeds needs one or more, each of them once"),
         ({"tasks": ("nowhere",)}, "there is no task nowhere; there are mortar-mayhem, "),
-        ({"tasks": ()}, "--tasks needs one task or more"),
+        ({"tasks": ()}, "--tasks needs one or more"),
         ({"out": Path("nowhere/picture")}, "there is no folder nowhere"),
         ({"report": True}, "there is no search of ppo_gru in "),
     ],
@@ -263,7 +280,7 @@ def test_the_fault_is_named(changes, message):
     assert not Path("tune").exists()
 
 
-@pytest.mark.parametrize(("name", "value"), [("steps_scale", 0.5), ("seeds", 2), ("tasks", ("mystery-path",))])
+@pytest.mark.parametrize(("name", "value"), [("steps_scale", 0.5), ("seeds", (2,)), ("tasks", ("mystery-path",))])
 def test_scores_that_do_not_compare_are_not_mixed(quick, name, value):
     tune.open_study(quick)
     with pytest.raises(ValueError, match=f"another --{name.replace('_', '-')}; use another --folder"):
@@ -272,7 +289,7 @@ def test_scores_that_do_not_compare_are_not_mixed(quick, name, value):
 
 def test_report_without_a_complete_trial(quick):
     tune.open_study(quick)
-    with pytest.raises(ValueError, match=r"no trial in .* is complete yet"):
+    with pytest.raises(ValueError, match="no trial of ppo_gru is complete yet"):
         tune.main(replace(quick, report=True))
 
 
