@@ -566,7 +566,7 @@ def draw_parameter(axis: Axes, name: str, complete: list[FrozenTrial]) -> None:
         axis.set_xticks(range(len(kind.choices)), [str(choice) for choice in kind.choices])
     else:
         axis.set(xscale="log", xlim=(kind.low / 1.1, kind.high * 1.1))
-        axis.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 3) if kind.high <= 100 * kind.low else (1,)))
         axis.xaxis.set_major_formatter("{x:g}")
         axis.xaxis.set_minor_locator(NullLocator())
     numbers, scores = [trial.number for trial in complete], [trial.value for trial in complete]
