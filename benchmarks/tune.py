@@ -24,7 +24,7 @@ Pruning: the tasks are trained in turns, slice by slice, so that a trial is alwa
 task after the other would make bad trials cheaper, but would judge most of them by the first task alone. After each
 slice a trial reports what no later slice can take away: half of its areas so far. That only grows, which suits the
 pruner, since it compares a trial's best report so far with the other trials' reports at that slice. A quarter of each
-training is warm-up, for in Mystery Path nothing is learned before. Half of the trials are kept, where the thesis kept a
+training is warm-up, for in Mystery Path little is learned before. Half of the trials are kept, where the thesis kept a
 quarter: the pruner compares with completed trials only, and these are the better ones.
 
 The tasks take --steps-scale 0.3 of their usual steps, 0.6 to 0.9 million: wanted is what learns a task in less than a

@@ -136,6 +136,20 @@ def test_slices_of_a_real_training(script, tiny):
     assert not list(Path("runs").iterdir()), "nothing is left behind"
 
 
+@each_script
+def test_iterations_train_as_the_script_does(script, tiny):
+    args = tiny(script, total_timesteps=192, anneal_steps=192, env_id="CartPole-v1", obs_type="vector")
+    run = script.setup(args)
+    script.train(args, run)
+    script.close(args, run)
+    own = tune.start(script, args)
+    for step in range(0, 192, 64):
+        tune.iteration(script, args, own, step, "success")
+    script.close(args, own)
+    pairs = zip(run.agent.parameters(), own.agent.parameters(), strict=True)
+    assert all(theirs.equal(ours) for theirs, ours in pairs)
+
+
 def test_a_slice_without_an_episode_has_the_last_one_s_score(tiny, monkeypatch):
     found = iter([[], [0.5], [], [0.7]])
     monkeypatch.setattr(tune, "iteration", lambda *rest: next(found))
