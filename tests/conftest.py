@@ -1,3 +1,7 @@
+import os
+
+os.environ["OMP_NUM_THREADS"] = "1"  # of the programs that tests start, too: as many threads, to the bit the same
+
 import cue_recall  # noqa: F401 (registers CueRecall-v0)
 import pytest
 import torch
