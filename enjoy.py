@@ -152,13 +152,13 @@ def attention_of(memory: ppo_trxl.Memory, x: Tensor, state: ppo_trxl.MemoryState
     """Return what the next step, x (N, D), attends to: weights (N, K, H, M) of the last M steps, the oldest first."""
     rows, age, seen = memory.look_back(state)
     x, found = x[:, None], []  # (N, 1, D)
-    encoding = memory.query_encoding(state.episode_step[:, None], x.dtype)
+    in_query = memory.in_query(state.episode_step[:, None], state.items[state.now - 1, :, -1:], x.dtype)
     for k, block in enumerate(memory.blocks):
-        position = encoding if k == 0 else 0.0
+        added = in_query if k == 0 else 0.0
         keys_values = state.keys[k][:, rows], state.values[k][:, rows]
-        query = block.norm_query(x + position)
+        query = block.norm_query(x + added)
         found.append(attention_weights(block.attention, query, keys_values[0], age, seen)[:, :, 0])
-        x = block(x, position, keys_values, age, seen)
+        x = block(x, added, keys_values, age, seen)
     return torch.stack(found, 1)
 
 

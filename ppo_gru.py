@@ -169,8 +169,8 @@ class Args:
     """before every epoch but the first, compute again what the rollout stored of memory, with the present weights"""
     bootstrap_truncated: bool = False
     """value the final observation of an episode that a time limit cut short, instead of counting it as ended"""
-    norm_adv: bool = False
-    """normalize the advantages of each minibatch"""
+    norm_adv: Literal["none", "minibatch", "batch"] = "none"
+    """bring the advantages of each minibatch, or of the whole rollout, to mean 0 and standard deviation 1"""
     clip_coef: PositiveFloat = 0.1
     """how far the probability ratio may move from 1, and the value from the rollout's"""
     clip_vloss: bool = True
@@ -193,10 +193,14 @@ class Args:
     """steps over which both decay linearly (0: both keep their initial values)"""
     reconstruction_coef: NonNegativeFloat = 0.0
     """weight of the loss of reconstructing the image from the memory's output (0: off; the thesis has 0.1)"""
+    reconstruction_detach: bool = False
+    """reconstruct it without teaching the agent: a probe of what the memory's output tells of the image"""
     ground_truth_coef: NonNegativeFloat = 0.0
     """weight of the loss of estimating the environment's ground truth (0: off; the thesis has 0.1)"""
     ground_truth_detach: bool = False
     """estimate it without teaching the agent: a probe of what its memory holds"""
+    embedding: bool = True
+    """embed the encoded observation in the memory's width (without, a GRU or LSTM takes it as it is)"""
     head_size: PositiveInt = 512
     """width of the layer after the memory, and of the heads' own layers"""
 
@@ -240,7 +244,12 @@ PRESETS = {
 }
 # What shapes the network; an error message names these if weights do not fit.
 OBSERVATION_FLAGS = ("env_id", "obs_type", "frame_stack", "step_encoding", "observe_last_action", "vector_frequencies")
-NETWORK_FLAGS = (*OBSERVATION_FLAGS, "head_size", "memory", "hidden_size", "num_layers")
+NETWORK_FLAGS = (*OBSERVATION_FLAGS, "embedding", "head_size", "memory", "hidden_size", "num_layers")
+
+
+def memory_width(args: Args) -> int:
+    """Return the width that the encoded observation is embedded in."""
+    return args.hidden_size
 
 
 def longest_piece(args: Args) -> int:
@@ -280,6 +289,11 @@ def gae(
     for t in reversed(range(len(deltas))):
         advantages[t] = advantage = deltas[t] + decay[t] * advantage
     return advantages
+
+
+def normalize(x: Tensor) -> Tensor:
+    """Return x with mean 0 and standard deviation 1."""
+    return (x - x.mean()) / (x.std(correction=0) + 1e-8)
 
 
 def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tensor:
@@ -431,12 +445,12 @@ def fourier_features(x: Tensor, frequencies: int) -> Tensor:
 
 
 class Encoder(nn.Module):
-    """Encodes each part of an observation, concatenates the features and embeds them in the memory's width (§5.1).
+    """Encodes each part of an observation, concatenates the features and embeds them in `width` (§5.1), unless None.
 
     Raises ValueError for frequencies without a vector to take them of.
     """
 
-    def __init__(self, spaces: dict[str, gym.spaces.Box], width: int, frequencies: int):
+    def __init__(self, spaces: dict[str, gym.spaces.Box], width: int | None, frequencies: int):
         super().__init__()
         self.frequencies = frequencies
         self.images = [name for name, space in spaces.items() if len(space.shape) == 3]
@@ -451,15 +465,19 @@ class Encoder(nn.Module):
             features += 128
         elif frequencies:
             raise ValueError("--vector-frequencies needs an observation with a vector; use 0")
-        self.embedding = layer_init(nn.Linear(features, width))
+        self.width = features if width is None else width
+        self.embedding = None if width is None else layer_init(nn.Linear(features, width))
 
     def forward(self, obs: dict[str, Tensor]) -> Tensor:
-        """Encode observations, each part (B, ...), to (B, D)."""
+        """Encode observations, each part (B, ...), to (B, self.width)."""
         features = [cnn(obs[name]) for cnn, name in zip(self.cnns, self.images, strict=True)]
         if self.vectors:
             vector = torch.cat([obs[name] for name in self.vectors], -1)
             features.append(F.relu(self.mlp(fourier_features(vector, self.frequencies))))
-        return F.relu(self.embedding(torch.cat(features, -1))).float()  # from bfloat16, with --amp
+        x = torch.cat(features, -1)
+        if self.embedding is not None:
+            x = F.relu(self.embedding(x))
+        return x.float()  # from bfloat16, with --amp
 
 
 class Heads(nn.Module):
@@ -522,10 +540,11 @@ class Decoder(nn.Sequential):
 
 
 # ---- 4 MEMORY ----
-# What the other sections use of a memory, whichever it is: Memory(args), an nn.Module of width D, and its MemoryState.
-# While acting: initial_state, begin_rollout, step (which also stores what the update needs), reset where an episode
-# ended. For the update: cut the rollout into pieces, and unroll pieces; rewind to the rollout's first step, to store
-# all again. And logs, numbers for TensorBoard. A checkpoint holds the MemoryState, but for the fields in `not_saved`.
+# What the other sections use of a memory, whichever it is: Memory(args, inputs), an nn.Module from I inputs to width D,
+# and its MemoryState. While acting: initial_state, begin_rollout, step (which also stores what the update needs), reset
+# where an episode ended. For the update: cut the rollout into pieces, and unroll pieces; rewind to the rollout's first
+# step, to store all again. And logs, numbers for TensorBoard. A checkpoint holds the MemoryState, but for the fields in
+# `not_saved`.
 class MemoryState(NamedTuple):
     """What N environments remember. `t` and `hidden` are replaced step by step, `stored` is written in place."""
 
@@ -543,15 +562,16 @@ class Memory(nn.Module):
 
     not_saved = ("stored",)  # in checkpoints: every rollout computes it before it is read
 
-    def __init__(self, args: Args):
+    def __init__(self, args: Args, inputs: int):
         super().__init__()
-        self.kind, self.seq_len, self.width = args.memory, args.seq_len, args.hidden_size
+        self.kind, self.seq_len = args.memory, args.seq_len
+        self.width = inputs if args.memory == "none" else args.hidden_size
         self.packed = args.memory == "gru"  # the update needs no padding on a CPU, see `unroll`
         self.hidden_vectors = args.num_layers * {"gru": 1, "lstm": 2, "none": 0}[args.memory]
         if args.memory != "none":
             rnn = nn.GRU if args.memory == "gru" else nn.LSTM
             # The outputs are activated already: another ReLU behind them would throw half of them away (§5.2.4).
-            self.rnn = layer_init(rnn(self.width, self.width, args.num_layers, batch_first=True), 1.0)
+            self.rnn = layer_init(rnn(inputs, self.width, args.num_layers, batch_first=True), 1.0)
 
     def initial_state(self, num_envs: int, num_steps: int, device: torch.device) -> MemoryState:
         """Return the memory of fresh episodes, zeros, with room for a rollout of num_steps."""
@@ -567,7 +587,7 @@ class Memory(nn.Module):
         return state._replace(t=0, hidden=state.stored[0].clone())
 
     def step(self, x: Tensor, state: MemoryState) -> tuple[Tensor, MemoryState]:
-        """Take one step of all environments: x (N, D) to (N, D), and the state after it. Stores the state before it.
+        """Take one step of all environments: x (N, I) to (N, D), and the state after it. Stores the state before it.
 
         Who only wants a value keeps the given state and takes the step again: that overwrites row t of what is stored.
         """
@@ -596,7 +616,7 @@ class Memory(nn.Module):
         return Pieces.beginning(begins)
 
     def unroll(self, x: Tensor, pieces: Pieces, state: MemoryState) -> Tensor:
-        """Run whole sequences: x (B, D) to (B, D), each from the stored hidden state of its first step."""
+        """Run whole sequences: x (B, I) to (B, D), each from the stored hidden state of its first step."""
         if self.kind == "none":
             return x
         hidden = state.stored.flatten(0, 1)[pieces.first.to(x.device)]  # (S, P, D)
@@ -607,7 +627,7 @@ class Memory(nn.Module):
         return pieces.unpad(y)
 
     def recur(self, x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Run the recurrent layers over x (S, L, D) from the hidden vectors (S, P, D); return outputs and the last."""
+        """Run the recurrent layers over x (S, L, I) from the hidden vectors (S, P, D); return outputs and the last."""
         hidden = hidden.transpose(0, 1).contiguous()  # (P, S, D)
         with torch.autocast(x.device.type, enabled=False):  # rounding errors would add up from step to step
             y, hidden = self.rnn(x, hidden if self.kind == "gru" else hidden.chunk(2))
@@ -630,8 +650,8 @@ class Agent(nn.Module):
 
     def __init__(self, space: gym.spaces.Dict, nvec: list[int], args: Args, ground_truth_size: int = 0):
         super().__init__()
-        self.memory = Memory(args)
-        self.encoder = Encoder(space.spaces, self.memory.width, args.vector_frequencies)
+        self.encoder = Encoder(space.spaces, memory_width(args) if args.embedding else None, args.vector_frequencies)
+        self.memory = Memory(args, self.encoder.width)
         self.heads = Heads(self.memory.width, nvec, args.head_size)
         with torch.random.fork_rng([]):  # with and without these, the random numbers that follow are the same
             self.decoder = Decoder(args.head_size, space.spaces) if args.reconstruction_coef else None
@@ -798,8 +818,8 @@ def ppo_loss(
         )
     log_ratio, entropy = log_probs - gather(rollout.log_probs), entropy.mean()  # (B, A), ()
     advantages, old_values, returns = gather(rollout.advantages), gather(rollout.values), gather(rollout.returns)
-    if args.norm_adv:
-        advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+    if args.norm_adv == "minibatch":
+        advantages = normalize(advantages)
     pg_loss = policy_loss(log_ratio, advantages, args.clip_coef)
     v_loss = value_loss(values, old_values, returns, args.clip_coef if args.clip_vloss else None)
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
@@ -823,7 +843,8 @@ def auxiliary_losses(
     losses = {}
     if agent.decoder is not None:
         with autocast(args, features.device):
-            logits = agent.decoder(features)  # (B, height, width, channels)
+            # (B, height, width, channels)
+            logits = agent.decoder(features.detach() if args.reconstruction_detach else features)
         losses["reconstruction"] = reconstruction_loss(logits.float(), gather(rollout.obs[agent.encoder.images[0]]))
     if agent.estimator is not None:
         estimate = agent.estimator((features.detach() if args.ground_truth_detach else features).float())  # (B, G)
@@ -854,12 +875,15 @@ def update(
 
     Raises FloatingPointError before a step that would spoil the weights.
     """
+    if args.norm_adv == "batch":
+        rollout.advantages = normalize(rollout.advantages)
     observations = UniqueObservations(rollout.obs, agent)
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
-    # A detached estimator is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
+    # What is detached is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
+    probes = ["estimator."] * args.ground_truth_detach + ["decoder."] * args.reconstruction_detach
     probe, parameters = [], []
     for name, parameter in agent.named_parameters():
-        (probe if args.ground_truth_detach and name.startswith("estimator.") else parameters).append(parameter)
+        (probe if name.startswith(tuple(probes)) else parameters).append(parameter)
     logs = []
     for epoch in range(args.update_epochs):
         if args.refresh_memory and epoch > 0:

@@ -172,8 +172,8 @@ class Args:
     """before every epoch but the first, compute again what the rollout stored of memory, with the present weights"""
     bootstrap_truncated: bool = False
     """value the final observation of an episode that a time limit cut short, instead of counting it as ended"""
-    norm_adv: bool = False
-    """normalize the advantages of each minibatch"""
+    norm_adv: Literal["none", "minibatch", "batch"] = "none"
+    """bring the advantages of each minibatch, or of the whole rollout, to mean 0 and standard deviation 1"""
     clip_coef: PositiveFloat = 0.1
     """how far the probability ratio may move from 1, and the value from the rollout's"""
     clip_vloss: bool = True
@@ -196,10 +196,14 @@ class Args:
     """steps over which both decay linearly (0: both keep their initial values)"""
     reconstruction_coef: NonNegativeFloat = 0.0
     """weight of the loss of reconstructing the image from the memory's output (0: off; the thesis has 0.1)"""
+    reconstruction_detach: bool = False
+    """reconstruct it without teaching the agent: a probe of what the memory's output tells of the image"""
     ground_truth_coef: NonNegativeFloat = 0.0
     """weight of the loss of estimating the environment's ground truth (0: off; the thesis has 0.1)"""
     ground_truth_detach: bool = False
     """estimate it without teaching the agent: a probe of what its memory holds"""
+    embedding: bool = True
+    """embed the encoded observation in the memory's width (without, a GRU or LSTM takes it as it is)"""
     head_size: PositiveInt = 512
     """width of the layer after the memory, and of the heads' own layers"""
 
@@ -224,6 +228,8 @@ class Args:
     """what tells the order of the steps that are looked back at"""
     trxl_query_position: bool = False
     """add the encoding of its own step to the first block's query too"""
+    trxl_query_output: bool = False
+    """add a projection of the last block's output of the step before to the first block's query, without gradient"""
     trxl_pe_length: PositiveInt = 2048
     """longest episode that a learned encoding is made for"""
     trxl_segment_length: PositiveInt = 128
@@ -232,6 +238,8 @@ class Args:
     """teach earlier steps of a segment what to leave for later ones: attend to their present inputs, with gradient"""
     trxl_init: Literal["xavier", "orthogonal", "kaiming", "tfixup"] = "xavier"
     """how the blocks' weights are initialized"""
+    trxl_layer_norm: Literal["pre", "post"] = "pre"
+    """where a block normalizes: what goes into attention and projection, or what comes out of their merging"""
     trxl_gate: Literal["none", "gru"] = "none"
     """what merges a layer's output with its input: residual connections (TrXL) or gates (GTrXL)"""
     trxl_gate_bias: bounded(float, "a finite number", math.isfinite) = 0.0
@@ -266,10 +274,17 @@ BLOCK_FLAGS = (
     "trxl_num_heads",
     "trxl_dim",
     "trxl_positional_encoding",
+    "trxl_query_output",
     "trxl_pe_length",
+    "trxl_layer_norm",
     "trxl_gate",
 )
-NETWORK_FLAGS = (*OBSERVATION_FLAGS, "head_size", *BLOCK_FLAGS)
+NETWORK_FLAGS = (*OBSERVATION_FLAGS, "embedding", "head_size", *BLOCK_FLAGS)
+
+
+def memory_width(args: Args) -> int:
+    """Return the width that the encoded observation is embedded in."""
+    return args.trxl_dim
 
 
 def longest_piece(args: Args) -> int:
@@ -309,6 +324,11 @@ def gae(
     for t in reversed(range(len(deltas))):
         advantages[t] = advantage = deltas[t] + decay[t] * advantage
     return advantages
+
+
+def normalize(x: Tensor) -> Tensor:
+    """Return x with mean 0 and standard deviation 1."""
+    return (x - x.mean()) / (x.std(correction=0) + 1e-8)
 
 
 def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tensor:
@@ -460,12 +480,12 @@ def fourier_features(x: Tensor, frequencies: int) -> Tensor:
 
 
 class Encoder(nn.Module):
-    """Encodes each part of an observation, concatenates the features and embeds them in the memory's width (§5.1).
+    """Encodes each part of an observation, concatenates the features and embeds them in `width` (§5.1), unless None.
 
     Raises ValueError for frequencies without a vector to take them of.
     """
 
-    def __init__(self, spaces: dict[str, gym.spaces.Box], width: int, frequencies: int):
+    def __init__(self, spaces: dict[str, gym.spaces.Box], width: int | None, frequencies: int):
         super().__init__()
         self.frequencies = frequencies
         self.images = [name for name, space in spaces.items() if len(space.shape) == 3]
@@ -480,15 +500,19 @@ class Encoder(nn.Module):
             features += 128
         elif frequencies:
             raise ValueError("--vector-frequencies needs an observation with a vector; use 0")
-        self.embedding = layer_init(nn.Linear(features, width))
+        self.width = features if width is None else width
+        self.embedding = None if width is None else layer_init(nn.Linear(features, width))
 
     def forward(self, obs: dict[str, Tensor]) -> Tensor:
-        """Encode observations, each part (B, ...), to (B, D)."""
+        """Encode observations, each part (B, ...), to (B, self.width)."""
         features = [cnn(obs[name]) for cnn, name in zip(self.cnns, self.images, strict=True)]
         if self.vectors:
             vector = torch.cat([obs[name] for name in self.vectors], -1)
             features.append(F.relu(self.mlp(fourier_features(vector, self.frequencies))))
-        return F.relu(self.embedding(torch.cat(features, -1))).float()  # from bfloat16, with --amp
+        x = torch.cat(features, -1)
+        if self.embedding is not None:
+            x = F.relu(self.embedding(x))
+        return x.float()  # from bfloat16, with --amp
 
 
 class Heads(nn.Module):
@@ -551,10 +575,11 @@ class Decoder(nn.Sequential):
 
 
 # ---- 4 MEMORY ----
-# What the other sections use of a memory, whichever it is: Memory(args), an nn.Module of width D, and its MemoryState.
-# While acting: initial_state, begin_rollout, step (which also stores what the update needs), reset where an episode
-# ended. For the update: cut the rollout into pieces, and unroll pieces; rewind to the rollout's first step, to store
-# all again. And logs, numbers for TensorBoard. A checkpoint holds the MemoryState, but for the fields in `not_saved`.
+# What the other sections use of a memory, whichever it is: Memory(args, inputs), an nn.Module from I inputs to width D,
+# and its MemoryState. While acting: initial_state, begin_rollout, step (which also stores what the update needs), reset
+# where an episode ended. For the update: cut the rollout into pieces, and unroll pieces; rewind to the rollout's first
+# step, to store all again. And logs, numbers for TensorBoard. A checkpoint holds the MemoryState, but for the fields in
+# `not_saved`.
 def visible(age: Tensor, episode_step: Tensor, window: int) -> Tensor:
     """Return whether a query at this step of its episode sees the item that was stored `age` steps before it.
 
@@ -639,12 +664,17 @@ class Gate(nn.Module):
 
 
 class Block(nn.Module):
-    """A transformer block with the layer norms first (figure 5.5): attention to the memory, then a projection."""
+    """A transformer block (figure 5.5): attention to the memory, then a projection, each merged with its input.
+
+    Layer norms come before both (figure 2.11b), or after both (figure 2.11a).
+    """
 
     def __init__(self, args: Args):
         super().__init__()
         width = args.trxl_dim
-        self.norm_query, self.norm_items, self.norm_output = (nn.LayerNorm(width) for _ in range(3))
+        before, after = (nn.LayerNorm, nn.Identity) if args.trxl_layer_norm == "pre" else (nn.Identity, nn.LayerNorm)
+        self.norm_query, self.norm_items, self.norm_hidden = before(width), before(width), before(width)
+        self.norm_attended, self.norm_output = after(width), after(width)
         self.attention = Attention(width, args.trxl_num_heads, args.trxl_positional_encoding == "relative")
         self.projection = nn.Linear(width, width)
         if args.trxl_gate == "gru":
@@ -657,10 +687,12 @@ class Block(nn.Module):
         items = self.norm_items(items)
         return self.attention.key(items), self.attention.value(items)
 
-    def forward(self, x: Tensor, position: Tensor | float, keys_values: tuple, age: Tensor, seen: Tensor) -> Tensor:
-        """Map x (S, L, D) to the next block's input (S, L, D); `position` (S, L, D) is added for the query alone."""
-        x = self.merge_attention(x, self.attention(self.norm_query(x + position), *keys_values, age, seen))
-        return self.merge_output(x, F.relu(self.projection(self.norm_output(x))))
+    def forward(self, x: Tensor, in_query: Tensor | float, keys_values: tuple, age: Tensor, seen: Tensor) -> Tensor:
+        """Map x (S, L, D) to the next block's input (S, L, D); `in_query` (S, L, D) is added for the query alone."""
+        x = self.merge_attention(x, self.attention(self.norm_query(x + in_query), *keys_values, age, seen))
+        x = self.norm_attended(x)
+        x = self.merge_output(x, F.relu(self.projection(self.norm_hidden(x))))
+        return self.norm_output(x)
 
 
 def block_init(block: Block, scheme: str, blocks: int) -> None:
@@ -690,7 +722,7 @@ class MemoryState(NamedTuple):
 
     now: int  # row of the step that comes next
     episode_step: Tensor  # (N,) which step of its episode that is
-    items: Tensor  # (W + T + 1, N, K, D) the input of every block
+    items: Tensor  # (W + T + 1, N, K, D) the input of every block, K; with --trxl-query-output also the output
     item_steps: Tensor  # (W + T + 1, N) which step of its episode an item was stored at
     keys: Tensor  # (K, N, W + T + 1, D) the items' projections, cached while acting
     values: Tensor  # (K, N, W + T + 1, D)
@@ -700,15 +732,18 @@ class Memory(nn.Module):
     """Transformer-XL as an episodic memory with a sliding window (§5.3), or GTrXL.
 
     Every step leaves an item, the inputs of the K blocks. A step's query in block k sees the k-th part of the items of
-    up to W steps before it, of the same episode, never its own. Raises ValueError for a width that does not suit.
+    up to W steps before it, of the same episode, never its own. `inputs` and the width are one. Raises ValueError for a
+    width that does not suit.
     """
 
     not_saved = ("keys", "values")  # in checkpoints: every rollout computes them before they are read
 
-    def __init__(self, args: Args):
+    def __init__(self, args: Args, inputs: int):
         super().__init__()
         if args.trxl_dim % args.trxl_num_heads or args.trxl_dim % 2:
             raise ValueError(f"--trxl-dim is {args.trxl_dim}; it must be even and a multiple of --trxl-num-heads")
+        if inputs != args.trxl_dim:
+            raise ValueError(f"--trxl-dim is {args.trxl_dim}; with --no-embedding it must be {inputs} here")
         self.width, self.window = args.trxl_dim, args.trxl_memory_length
         self.segment_length, self.query_position = args.trxl_segment_length, args.trxl_query_position
         self.encoding, self.memory_gradient = args.trxl_positional_encoding, args.trxl_memory_gradient
@@ -719,15 +754,17 @@ class Memory(nn.Module):
         if self.encoding == "learned":
             length = args.trxl_pe_length + 1  # one for what follows an episode's last step, which may be valued
             self.table = nn.Parameter(torch.randn(length, self.width) / math.sqrt(self.width))
+        self.query_output = nn.Linear(self.width, self.width, bias=False) if args.trxl_query_output else None
 
     def initial_state(self, num_envs: int, num_steps: int, device: torch.device) -> MemoryState:
         """Return the memory of fresh episodes, which has no items, with room for a rollout of num_steps."""
         rows = self.window + num_steps + 1
         cache = (len(self.blocks), num_envs, rows, self.width)
+        parts = len(self.blocks) + (self.query_output is not None)
         return MemoryState(
             now=self.window,
             episode_step=torch.zeros(num_envs, dtype=torch.int64),
-            items=torch.zeros(rows, num_envs, len(self.blocks), self.width, device=device),
+            items=torch.zeros(rows, num_envs, parts, self.width, device=device),
             item_steps=torch.zeros(rows, num_envs, dtype=torch.int64),
             keys=torch.zeros(cache, dtype=self.cache_dtype, device=device),
             values=torch.zeros(cache, dtype=self.cache_dtype, device=device),
@@ -761,7 +798,7 @@ class Memory(nn.Module):
         rows, age, seen = self.look_back(state)
         episode_step = state.episode_step.to(x.device)[:, None]  # (N, 1)
         position = self.position(episode_step, x.dtype)  # (N, 1, D)
-        query_encoding = self.query_encoding(episode_step, x.dtype)
+        in_query = self.in_query(episode_step, state.items[state.now - 1, :, -1:], x.dtype)
         state.item_steps[state.now] = state.episode_step
         x = x[:, None]  # (N, 1, D)
         for k, block in enumerate(self.blocks):
@@ -769,7 +806,9 @@ class Memory(nn.Module):
             key, value = block.keys_values(x + position)  # (N, 1, D) each
             state.keys[k][:, state.now], state.values[k][:, state.now] = key[:, 0], value[:, 0]
             window = state.keys[k][:, rows], state.values[k][:, rows]  # (N, M, D) each
-            x = block(x, query_encoding if k == 0 else 0.0, window, age, seen)
+            x = block(x, in_query if k == 0 else 0.0, window, age, seen)
+        if self.query_output is not None:
+            state.items[state.now, :, -1:] = x
         return x[:, 0], state._replace(now=state.now + 1, episode_step=state.episode_step + 1)
 
     def look_back(self, state: MemoryState) -> tuple[slice, Tensor, Tensor]:
@@ -831,14 +870,14 @@ class Memory(nn.Module):
         used = seen.any(1)  # (S, M); what no query sees becomes zero, so that not even a NaN in it has an effect
         items, item_steps = items.masked_fill(~used[..., None, None], 0.0), item_steps.where(used, 0)
         position = self.position(item_steps, x.dtype)  # (S, M, D)
-        query_encoding = self.query_encoding(episode_step, x.dtype)
+        in_query = self.in_query(episode_step, items[:, before - 1 :, -1], x.dtype)
         for k, block in enumerate(self.blocks):
             block_items = items[:, :, k]
             if self.memory_gradient:
                 own = x[:, :-1].masked_fill(~used[:, before:, None], 0.0)
                 block_items = torch.cat([block_items[:, :before], own], 1)
             keys_values = block.keys_values(block_items + position)
-            x = block(x, query_encoding if k == 0 else 0.0, keys_values, age, seen)
+            x = block(x, in_query if k == 0 else 0.0, keys_values, age, seen)
         return pieces.unpad(x)
 
     def position(self, episode_step: Tensor, dtype: torch.dtype) -> Tensor | float:
@@ -847,11 +886,19 @@ class Memory(nn.Module):
             return self.table[episode_step]
         return sinusoid(episode_step, self.width).to(dtype) if self.encoding == "absolute" else 0.0
 
-    def query_encoding(self, episode_step: Tensor, dtype: torch.dtype) -> Tensor | float:
-        """Return what is added to the first block's query (S, L, D) so that it knows its own step (§7.1.3), if any."""
-        if not self.query_position:
-            return 0.0
-        return self.table[episode_step] if self.encoding == "learned" else sinusoid(episode_step, self.width).to(dtype)
+    def in_query(self, episode_step: Tensor, output_before: Tensor, dtype: torch.dtype) -> Tensor | float:
+        """Return what the first block's query (S, L, D) has beside its observation (§7.1.3).
+
+        That is the encoding of its own step, episode_step (S, L), and a projection of the last block's output of the
+        step before, output_before (S, L, D), each if wanted.
+        """
+        added = 0.0
+        if self.query_position:
+            learned = self.encoding == "learned"
+            added = self.table[episode_step] if learned else sinusoid(episode_step, self.width).to(dtype)
+        if self.query_output is not None:
+            added = added + self.query_output(output_before.masked_fill(episode_step[..., None] == 0, 0.0))
+        return added
 
     def check_length(self, episode_step: Tensor) -> None:
         """Raise MemoryLimit if an episode outlasts the learned encoding's table."""
@@ -876,8 +923,8 @@ class Agent(nn.Module):
 
     def __init__(self, space: gym.spaces.Dict, nvec: list[int], args: Args, ground_truth_size: int = 0):
         super().__init__()
-        self.memory = Memory(args)
-        self.encoder = Encoder(space.spaces, self.memory.width, args.vector_frequencies)
+        self.encoder = Encoder(space.spaces, memory_width(args) if args.embedding else None, args.vector_frequencies)
+        self.memory = Memory(args, self.encoder.width)
         self.heads = Heads(self.memory.width, nvec, args.head_size)
         with torch.random.fork_rng([]):  # with and without these, the random numbers that follow are the same
             self.decoder = Decoder(args.head_size, space.spaces) if args.reconstruction_coef else None
@@ -1044,8 +1091,8 @@ def ppo_loss(
         )
     log_ratio, entropy = log_probs - gather(rollout.log_probs), entropy.mean()  # (B, A), ()
     advantages, old_values, returns = gather(rollout.advantages), gather(rollout.values), gather(rollout.returns)
-    if args.norm_adv:
-        advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+    if args.norm_adv == "minibatch":
+        advantages = normalize(advantages)
     pg_loss = policy_loss(log_ratio, advantages, args.clip_coef)
     v_loss = value_loss(values, old_values, returns, args.clip_coef if args.clip_vloss else None)
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
@@ -1069,7 +1116,8 @@ def auxiliary_losses(
     losses = {}
     if agent.decoder is not None:
         with autocast(args, features.device):
-            logits = agent.decoder(features)  # (B, height, width, channels)
+            # (B, height, width, channels)
+            logits = agent.decoder(features.detach() if args.reconstruction_detach else features)
         losses["reconstruction"] = reconstruction_loss(logits.float(), gather(rollout.obs[agent.encoder.images[0]]))
     if agent.estimator is not None:
         estimate = agent.estimator((features.detach() if args.ground_truth_detach else features).float())  # (B, G)
@@ -1100,12 +1148,15 @@ def update(
 
     Raises FloatingPointError before a step that would spoil the weights.
     """
+    if args.norm_adv == "batch":
+        rollout.advantages = normalize(rollout.advantages)
     observations = UniqueObservations(rollout.obs, agent)
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
-    # A detached estimator is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
+    # What is detached is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
+    probes = ["estimator."] * args.ground_truth_detach + ["decoder."] * args.reconstruction_detach
     probe, parameters = [], []
     for name, parameter in agent.named_parameters():
-        (probe if args.ground_truth_detach and name.startswith("estimator.") else parameters).append(parameter)
+        (probe if name.startswith(tuple(probes)) else parameters).append(parameter)
     logs = []
     for epoch in range(args.update_epochs):
         if args.refresh_memory and epoch > 0:

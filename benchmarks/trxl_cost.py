@@ -80,7 +80,7 @@ def shares(config: Config) -> None:
 def step_times(config: Config, window: int) -> tuple[float, float]:
     """Return the median seconds of a step of the memory with a full window, and of its attention alone."""
     args = ppo_trxl.Args(trxl_memory_length=window, num_steps=config.repeats)
-    memory = ppo_trxl.Memory(args)
+    memory = ppo_trxl.Memory(args, args.trxl_dim)
     state = memory.initial_state(args.num_envs, args.num_steps, torch.device("cpu"))
     state.episode_step.add_(window)
     x = torch.randn(args.num_envs, memory.width)

@@ -106,7 +106,7 @@ SPACE = {
     "gae_lambda": one_of(0.9, 0.95, 0.98),
     "vf_coef": one_of(0.25, 0.5, 1.0),
     "clip_vloss": one_of(True, False),
-    "norm_adv": one_of(True, False),  # table 6.1
+    "norm_adv": one_of("minibatch", "none", "batch"),  # table 6.1
 }
 OWN_SPACE = {
     "ppo_gru": {
@@ -117,6 +117,7 @@ OWN_SPACE = {
         # Not the learned encoding of table 6.1: its table has an end, and an endless episode has none.
         "trxl_positional_encoding": one_of("absolute", "relative", "none"),
         "trxl_segment_length": one_of(16, 32, 64, 128),
+        "trxl_memory_gradient": one_of(False, True),
         "trxl_init": one_of("xavier", "orthogonal", "kaiming", "tfixup"),  # table 6.1
     },
 }

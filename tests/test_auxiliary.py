@@ -15,6 +15,7 @@ from ppo_gru import Agent, Args, Decoder, reconstruction_loss
 
 HEADS = {"reconstruction_coef": 0.1, "ground_truth_coef": 0.1}
 SCRIPTS = pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
+PROBES = pytest.mark.parametrize(("name", "part"), [("ground_truth", "estimator"), ("reconstruction", "decoder")])
 
 
 def loss_of(script, args, run):
@@ -89,31 +90,33 @@ def test_the_ground_truth_belongs_to_the_observation(played, script):
 
 
 @SCRIPTS
-def test_a_probe_teaches_nobody_else(played, script):
-    changes = {"script": script, "env_id": "MortarMayhem-Grid-v0", "ground_truth_coef": 10.0}
+@PROBES
+def test_a_probe_teaches_nobody_else(played, script, name, part):
+    changes = {"script": script, "env_id": "MortarMayhem-Grid-v0", f"{name}_coef": 10.0}
     found = {}
     for detach in (False, True):
-        args, run, *_ = played(**changes, ground_truth_detach=detach)
+        args, run, *_ = played(**changes, **{f"{name}_detach": detach})
         found[detach] = loss_of(script, args, run)[2]
     args, run, *_ = played(script=script, env_id="MortarMayhem-Grid-v0")
     without = loss_of(script, args, run)[2]
     for name, gradient in without.items():
         assert found[True][name].equal(gradient), name
     assert not found[False]["encoder.embedding.weight"].equal(without["encoder.embedding.weight"])
-    assert found[True]["estimator.0.weight"].abs().sum() > 0
+    assert found[True][f"{part}.0.weight"].abs().sum() > 0
 
 
 @SCRIPTS
-def test_a_run_with_a_probe_is_the_run_without(tiny, curves, script):
+@PROBES
+def test_a_run_with_a_probe_is_the_run_without(tiny, curves, script, name, part):
     """To the last bit, however much the probe's loss weighs: the gradient's clipping does not see it."""
-    args = tiny(script, env_id="MortarMayhem-Grid-v0", obs_type="vector", ground_truth_detach=True)
+    args = tiny(script, env_id="MortarMayhem-Grid-v0", **{f"{name}_detach": True})
     without, probed = (
-        curves(script.main(dataclasses.replace(args, exp_name=name, ground_truth_coef=coef)))
-        for name, coef in (("without", 0.0), ("probed", 100.0))
+        curves(script.main(dataclasses.replace(args, exp_name=exp_name, **{f"{name}_coef": coef})))
+        for exp_name, coef in (("without", 0.0), ("probed", 100.0))
     )
-    assert probed["losses/ground_truth_loss"][0][1] > 0
-    for name in set(without) - {"losses/loss"}:
-        assert probed[name] == without[name], name
+    assert probed[f"losses/{name}_loss"][0][1] > 0
+    for curve in set(without) - {"losses/loss"}:
+        assert probed[curve] == without[curve], curve
 
 
 def test_heads_that_are_off_cost_nothing(played):

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+import ppo_gru
 from ppo_gru import UniqueObservations, anneal, explained_variance, policy_loss, ppo_loss, value_loss
 
 
@@ -61,6 +62,33 @@ def test_the_total_loss_is_composed_as_in_equation_5_7(played):
     assert logs["policy_loss"].item() == pytest.approx(-rollout.advantages.mean().item())
     parts = logs["policy_loss"] + 3.0 * logs["value_loss"] - 5.0 * logs["entropy"]
     assert loss.item() == pytest.approx(parts.item())
-    normalize = dataclasses.replace(args, norm_adv=True)
+    normalize = dataclasses.replace(args, norm_adv="minibatch")
     normalized = ppo_loss(agent, rollout, observations, pieces, 5.0, normalize)[1]
     assert normalized["policy_loss"].item() == pytest.approx(0.0, abs=1e-5), "advantages of mean zero"
+
+
+def test_advantages_are_normalized_by_minibatch_or_by_rollout(played, monkeypatch):
+    """By rollout, its advantages have mean 0 and deviation 1, once; the returns stay."""
+    args, run, *_ = played(env_id="CueRecall-v0", norm_adv="batch")
+    rollout, seen = run.rollout, []
+    advantages = rollout.advantages = torch.randn_like(rollout.values) * 3 + 2
+    returns = rollout.returns = advantages + rollout.values
+    surrogate = ppo_gru.policy_loss
+
+    def spy(log_ratio, advantages, clip_coef):
+        seen.append(advantages)
+        return surrogate(log_ratio, advantages, clip_coef)
+
+    monkeypatch.setattr(ppo_gru, "policy_loss", spy)
+    ppo_gru.update(run.agent, run.optimizer, rollout, 0.0, args)
+    torch.testing.assert_close(rollout.advantages, (advantages - advantages.mean()) / advantages.std(correction=0))
+    assert rollout.returns is returns
+    whole = torch.cat(seen[: args.num_minibatches]).sort().values
+    torch.testing.assert_close(whole, rollout.advantages.flatten().sort().values)
+
+    seen.clear()
+    ppo_gru.update(run.agent, run.optimizer, rollout, 0.0, dataclasses.replace(args, norm_adv="minibatch"))
+    assert len(seen) > 1
+    for each in seen:
+        assert each.mean().item() == pytest.approx(0.0, abs=1e-5)
+        assert each.std(correction=0).item() == pytest.approx(1.0, abs=1e-4)

@@ -19,12 +19,14 @@ RECURRENT = [
     {"memory": "gru", "num_layers": 2, "seq_len": 5},
     {"memory": "lstm"},
     {"memory": "lstm", "num_layers": 2, "seq_len": 5},
+    {"memory": "gru", "embedding": False},
 ]
 TRANSFORMER = [
     {"script": ppo_trxl, "trxl_positional_encoding": "absolute"},
     {"script": ppo_trxl, "trxl_positional_encoding": "relative", "trxl_gate": "gru", "trxl_segment_length": 5},
     {"script": ppo_trxl, "trxl_positional_encoding": "learned", "trxl_memory_length": 40, "trxl_query_position": True},
     {"script": ppo_trxl, "trxl_memory_gradient": True, "trxl_segment_length": 5},
+    {"script": ppo_trxl, "trxl_layer_norm": "post", "trxl_query_output": True, "trxl_segment_length": 5},
 ]
 MEMORIES = [*RECURRENT, *TRANSFORMER, {"memory": "none"}]
 
@@ -144,7 +146,7 @@ def test_no_gradient_crosses_the_end_of_an_episode(played, memory):
     _, run, *_ = played(env_id="CueRecall-v0", **memory)
     rollout = run.rollout
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
-    x = torch.randn(int(pieces.length.sum()), 32, requires_grad=True)
+    x = torch.randn(int(pieces.length.sum()), run.agent.encoder.width, requires_grad=True)
     y = run.agent.memory.unroll(x, pieces, rollout.memory_state)
     ends = pieces.length.cumsum(0)
     piece = int((pieces.length > 2).nonzero()[1, 0])
@@ -156,7 +158,7 @@ def test_no_gradient_crosses_the_end_of_an_episode(played, memory):
 
 def test_gru_equals_a_loop_over_cells():
     torch.manual_seed(0)
-    memory = ppo_gru.Memory(ppo_gru.Args(hidden_size=8)).double()
+    memory = ppo_gru.Memory(ppo_gru.Args(hidden_size=8), 8).double()
     cell = torch.nn.GRUCell(8, 8).double()
     cell.load_state_dict({name.removesuffix("_l0"): value for name, value in memory.rnn.state_dict().items()})
     x, hidden = torch.randn(3, 6, 8).double(), torch.randn(3, 1, 8).double()

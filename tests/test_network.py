@@ -2,6 +2,7 @@
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import torch
 
 import ppo_gru
@@ -34,6 +35,16 @@ def test_sizes_of_table_6_2():
     assert agent.encoder.embedding.in_features == 3264
 
 
+def test_without_an_embedding_the_memory_takes_the_encoded_observation():
+    agent = Agent(PIXELS, [3, 3], Args(embedding=False))
+    assert agent.encoder.embedding is None
+    assert (agent.memory.rnn.input_size, agent.memory.rnn.hidden_size) == (3136, 512)
+    agent = Agent(PIXELS, [3, 3], Args(embedding=False, memory="none"))
+    assert agent.heads.trunk.in_features == 3136
+    with pytest.raises(ValueError, match="--trxl-dim is 384; with --no-embedding it must be 3136 here"):
+        ppo_trxl.Agent(PIXELS, [3, 3], ppo_trxl.Args(embedding=False))
+
+
 def test_fourier_features_of_a_vector():
     x, root = torch.tensor([[0.25, 1.0]]), 0.5**0.5
     wanted = torch.tensor([[0.25, 1.0, root, 1.0, 0.0, 0.0, root, 0.0, -1.0, 1.0]])
@@ -48,7 +59,7 @@ def test_defaults_are_the_final_column_of_table_6_1():
     args = Args()
     final = {
         "num_levels": 100_000, "num_envs": 32, "num_steps": 512, "gamma": 0.995, "gae_lambda": 0.95,
-        "update_epochs": 3, "num_minibatches": 8, "norm_adv": False, "clip_coef": 0.1, "vf_coef": 0.5,
+        "update_epochs": 3, "num_minibatches": 8, "norm_adv": "none", "clip_coef": 0.1, "vf_coef": 0.5,
         "init_lr": 2.75e-4, "final_lr": 1e-5, "init_ent_coef": 1e-4, "final_ent_coef": 1e-6, "max_grad_norm": 0.25,
         "num_layers": 1, "memory": "gru", "hidden_size": 512, "anneal_steps": 163_840_000,
     }  # fmt: skip

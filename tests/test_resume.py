@@ -27,7 +27,7 @@ RUNS = {
     "LSTM, endless pixels, reconstruction": {
         "env_id": "Endless-MortarMayhem-v0", "memory": "lstm", "reconstruction_coef": 0.1
     },
-    "no memory, stack": {**GRID, "memory": "none", "frame_stack": 3, "step_encoding": True, "norm_adv": True},
+    "no memory, stack": {**GRID, "memory": "none", "frame_stack": 3, "step_encoding": True, "norm_adv": "batch"},
     "GRU, ground truth": {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "ground_truth_coef": 0.1},
     "GRU, probe": {**GRID, "ground_truth_coef": 0.1, "ground_truth_detach": True, "observe_last_action": True},
     "GRU, evaluations": {**GRID, "eval_interval": 2, "eval_levels": 3, "eval_repeats": 2, "target_kl": 1e-4},

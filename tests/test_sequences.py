@@ -15,17 +15,17 @@ def pieces_of(memory, done):
 
 
 def test_pieces_end_where_episodes_do():
-    memory = Memory(Args(hidden_size=4))
+    memory = Memory(Args(hidden_size=4), 4)
     assert pieces_of(memory, DONE) == [(0, 3), (6, 2), (1, 1), (3, 4)]
 
 
 def test_pieces_end_after_seq_len_steps_counted_from_the_episode_s_first():
-    memory = Memory(Args(hidden_size=4, seq_len=2))
+    memory = Memory(Args(hidden_size=4, seq_len=2), 4)
     assert pieces_of(memory, DONE) == [(0, 2), (4, 1), (6, 2), (1, 1), (3, 2), (7, 2)]
 
 
 def test_without_memory_every_step_is_a_piece():
-    memory = Memory(Args(hidden_size=4, memory="none"))
+    memory = Memory(Args(hidden_size=4, memory="none"), 4)
     assert pieces_of(memory, DONE) == [(t * 2 + n, 1) for n in (0, 1) for t in range(5)]
 
 
@@ -38,7 +38,7 @@ def test_the_drawn_example():
     """What the docstring of Pieces draws."""
     done = torch.zeros(5, 2, dtype=torch.bool)
     done[2, 0] = True
-    pieces = Memory(Args(hidden_size=4)).cut(done)
+    pieces = Memory(Args(hidden_size=4), 4).cut(done)
     assert (pieces.first.tolist(), pieces.length.tolist()) == ([0, 6, 1], [3, 2, 5])
     assert pieces.flat_index().tolist() == [0, 2, 4, 6, 8, 1, 3, 5, 7, 9]
     x = pieces.flat_index()[:, None].float() + 1
@@ -51,7 +51,7 @@ def test_the_drawn_example():
 def test_minibatches_deal_every_step_once(seq_len):
     torch.manual_seed(0)
     done = torch.rand(64, 8) < 0.05
-    pieces = Memory(Args(hidden_size=4, seq_len=seq_len)).cut(done)
+    pieces = Memory(Args(hidden_size=4, seq_len=seq_len), 4).cut(done)
     minibatches = list(pieces.minibatches(4))
     steps = torch.cat([minibatch.flat_index() for minibatch in minibatches])
     assert sorted(steps.tolist()) == list(range(64 * 8))
@@ -63,21 +63,21 @@ def test_minibatches_deal_every_step_once(seq_len):
 
 
 def test_no_minibatch_is_empty_at_the_limit_of_check_args():
-    pieces = Memory(Args(hidden_size=4)).cut(torch.zeros(16, 8, dtype=torch.bool))
+    pieces = Memory(Args(hidden_size=4), 4).cut(torch.zeros(16, 8, dtype=torch.bool))
     assert [len(minibatch.first) for minibatch in pieces.minibatches(8)] == [1] * 8
 
 
 def test_no_piece_spans_an_episode_s_end():
     torch.manual_seed(1)
     done = torch.rand(50, 6) < 0.1
-    pieces = Memory(Args(hidden_size=4, seq_len=9)).cut(done)
+    pieces = Memory(Args(hidden_size=4, seq_len=9), 4).cut(done)
     for first, length in zip(pieces.first.tolist(), pieces.length.tolist(), strict=True):
         assert not done.flatten()[[first + i * 6 for i in range(length - 1)]].any()
 
 
 @pytest.mark.parametrize("seq_len", [0, 8])
 def test_padded_length_is_the_longest_piece(seq_len, monkeypatch):
-    memory = Memory(Args(hidden_size=4, seq_len=seq_len))
+    memory = Memory(Args(hidden_size=4, seq_len=seq_len), 4)
     memory.packed = False  # packed pieces have no padding
     seen = []
     recur = memory.recur

@@ -18,7 +18,7 @@ def make_memory(**changes):
     """A small memory in float64 whose parameters are all random: zeros would hide a missing term."""
     small = {"trxl_dim": WIDTH, "trxl_num_heads": 2, "trxl_num_layers": 2, "trxl_memory_length": 5, "num_steps": STEPS}
     torch.manual_seed(0)
-    memory = Memory(Args(**{**small, "trxl_segment_length": 8, "trxl_pe_length": 64, **changes})).double()
+    memory = Memory(Args(**{**small, "trxl_segment_length": 8, "trxl_pe_length": 64, **changes}), WIDTH).double()
     for parameter in memory.parameters():
         torch.nn.init.normal_(parameter, std=0.5)
     return memory
@@ -34,7 +34,8 @@ def make_timeline(memory, seed=1):
     """Random items, and the steps of episodes that end at random; in environment 0 one also ends before the rollout."""
     generator = torch.Generator().manual_seed(seed)
     rows = memory.window + STEPS + 1
-    items = torch.randn(rows, LANES, len(memory.blocks), WIDTH, dtype=torch.float64, generator=generator)
+    parts = len(memory.blocks) + (memory.query_output is not None)
+    items = torch.randn(rows, LANES, parts, WIDTH, dtype=torch.float64, generator=generator)
     ends = torch.rand(rows, LANES, generator=generator) < 0.15
     ends[memory.window, 0] = True
     steps = torch.zeros(rows, LANES, dtype=torch.int64)
@@ -52,7 +53,9 @@ def naive(memory, x, row, lane, stored, own=None):
     step = int(stored.item_steps[row, lane])
     window = min(step, memory.window)
     at = torch.arange(row - window, row)
-    told = memory.query_encoding(stored.item_steps[row, lane], x.dtype)
+    told = memory.in_query(stored.item_steps[row, lane], torch.zeros_like(x), x.dtype)
+    if memory.query_output is not None and step > 0:
+        told = told + memory.query_output.weight @ stored.items[row - 1, lane, -1]
     inputs = []
     for k, block in enumerate(memory.blocks):
         attention = block.attention
@@ -62,7 +65,9 @@ def naive(memory, x, row, lane, stored, own=None):
             recent = torch.stack([each[k] for each in own])[-window or len(own) :]
             items = torch.cat([items[: window - len(recent)], recent])
         items = items + memory.position(stored.item_steps[at, lane], x.dtype)
-        normed, query = block.norm_items(items), block.norm_query(x + (told if k == 0 else 0.0))
+        normed, query = items, x + (told if k == 0 else 0.0)
+        if isinstance(block.norm_query, torch.nn.LayerNorm):  # behind attention and projection instead: figure 2.11a
+            normed, query = block.norm_items(items), block.norm_query(query)
         heads, size = [], WIDTH // attention.heads
         for h in range(attention.heads):
             of = slice(h * size, (h + 1) * size)
@@ -75,7 +80,11 @@ def naive(memory, x, row, lane, stored, own=None):
             heads.append((scores / math.sqrt(size)).softmax(-1) @ (normed @ w_v))
         attended = attention.output(torch.cat(heads)) if window else torch.zeros_like(x)
         x = block.merge_attention(x, attended)
-        x = block.merge_output(x, F.relu(block.projection(block.norm_output(x))))
+        if isinstance(block.norm_query, torch.nn.LayerNorm):
+            x = block.merge_output(x, F.relu(block.projection(block.norm_hidden(x))))
+        else:
+            x = block.norm_attended(x)
+            x = block.norm_output(block.merge_output(x, F.relu(block.projection(x))))
     if own is not None:
         own.append(inputs)
     return x
@@ -84,7 +93,16 @@ def naive(memory, x, row, lane, stored, own=None):
 VARIANTS = [
     {"trxl_positional_encoding": encoding, "trxl_gate": gate, "trxl_memory_length": window}
     for encoding, gate, window in itertools.product(ENCODINGS, ["none", "gru"], [1, 5, 13, 40])
-] + [{"trxl_positional_encoding": encoding, "trxl_query_position": True} for encoding in ENCODINGS]
+] + [
+    {"trxl_positional_encoding": encoding, **changes}
+    for encoding in ENCODINGS
+    for changes in (
+        {"trxl_query_position": True},
+        {"trxl_query_output": True},
+        {"trxl_query_position": True, "trxl_query_output": True, "trxl_layer_norm": "post"},
+        {"trxl_gate": "gru", "trxl_layer_norm": "post"},
+    )
+]
 
 
 @pytest.mark.parametrize("changes", VARIANTS)
@@ -340,7 +358,7 @@ def test_sinusoid():
 @pytest.mark.parametrize("scheme", ["xavier", "orthogonal", "kaiming", "tfixup"])
 def test_initialization(scheme):
     torch.manual_seed(0)
-    block = Memory(Args(trxl_init=scheme, trxl_num_layers=4)).blocks[0]
+    block = Memory(Args(trxl_init=scheme, trxl_num_layers=4), 384).blocks[0]
     deviation = {"xavier": 384**-0.5, "orthogonal": 384**-0.5, "kaiming": (2 / 384) ** 0.5, "tfixup": 384**-0.5}[scheme]
     scale = 0.67 * 4**-0.25 if scheme == "tfixup" else 1.0
     assert block.attention.query.weight.std().item() == pytest.approx(deviation, rel=0.02)
