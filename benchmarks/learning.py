@@ -1,16 +1,18 @@
-"""Does memory matter? Trains agents with and without it on two small tasks, and tabulates what they reach.
+"""Does memory matter, and which one? Trains agents on small tasks, and tabulates what they reach.
 
     python benchmarks/learning.py --jobs 2 --out docs/learning
+    python benchmarks/learning.py --tasks endless-mortar-mayhem --agents GRU TrXL "TrXL, gradient" --steps-scale 6
 
 Vector observations and small networks, so that a run takes minutes on a core. Every agent sees the same vectors, the
 stack the last four of them. Scores are those of evaluations during training, on levels outside the training set
-(6.1.3). A run that is there already, whole, is not trained again.
+(6.1.3). A run that is there already, whole, is not trained again, and one that was stopped goes on.
 """
 
 import glob
 import importlib
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -27,11 +29,22 @@ import evaluate
 
 ROOT = Path(__file__).parent.parent
 COMMON = "--preset laptop --save-model"
+MEMORIES = {
+    "GRU": "ppo_gru.py --memory gru",
+    "LSTM": "ppo_gru.py --memory lstm",
+    "TrXL": "ppo_trxl.py",
+    "GTrXL": "ppo_trxl.py --trxl-gate gru",
+}
 AGENTS = {
     "no memory": "ppo_gru.py --memory none",
     "stack of 4": "ppo_gru.py --memory none --frame-stack 4",
-    "GRU": "ppo_gru.py --memory gru",
-    "TrXL": "ppo_trxl.py",
+    **MEMORIES,
+    **{f"{name}, refreshed": f"{flags} --refresh-memory" for name, flags in MEMORIES.items()},
+    **{f"{name}, gradient": f"{MEMORIES[name]} --trxl-memory-gradient" for name in ("TrXL", "GTrXL")},
+    **{
+        f"{name}, gradient, refreshed": f"{MEMORIES[name]} --trxl-memory-gradient --refresh-memory"
+        for name in ("TrXL", "GTrXL")
+    },
 }
 
 
@@ -59,7 +72,7 @@ TASKS = {
             "explosion_duration": [2],
         },
         "commands_completed",
-        2_000_000,
+        1_000_000,
         "",
     ),
     "mystery-path": Task(
@@ -68,9 +81,9 @@ TASKS = {
         # without this, chance finds too few goals.
         {"cardinal_origin_choice": [0], "reward_path_progress": 0.1},
         "success",
-        3_000_000,
+        1_500_000,
         # To remember tiles, an agent has to tell them apart; their coordinates alone differ by a seventh.
-        "--init-lr 7e-4 --init-ent-coef 0.003 --final-ent-coef 0.0001 --vector-frequencies 4",
+        "--vector-frequencies 4",
         # Where the agent fell matters, not when.
         "--trxl-positional-encoding none",
     ),
@@ -87,7 +100,7 @@ TASKS = {
             "command_show_delay": [0],
         },
         "commands_completed",
-        2_000_000,
+        1_000_000,
         "",
     ),
 }
@@ -99,8 +112,10 @@ class Config:
 
     tasks: tuple[str, ...] = ("mortar-mayhem", "mystery-path")
     """of those that this program knows"""
-    agents: tuple[str, ...] = tuple(AGENTS)
+    agents: tuple[str, ...] = ("no memory", "stack of 4", "GRU", "TrXL")
     """of those that this program knows"""
+    steps_scale: float = 1.0
+    """share of a task's steps to train for"""
     seeds: tuple[int, ...] = (1, 2, 3)
     """a training run each"""
     jobs: int = 1
@@ -113,15 +128,26 @@ class Config:
     """draw the curves to OUT.png and OUT.svg"""
 
 
-def command(task: Task, agent: str, seed: int, evaluations: int) -> list[str]:
+def steps_of(config: Config, task: Task) -> int:
+    """Return the steps that a run trains for."""
+    return int(task.total_timesteps * config.steps_scale)
+
+
+def file_name(agent: str) -> str:
+    """Return an agent's name as part of a file's name."""
+    return re.sub(r"\W+", "-", agent)
+
+
+def command(config: Config, task: Task, agent: str, seed: int) -> list[str]:
     """Return the command line of a training run."""
     script, *memory = AGENTS[agent].split()
+    steps = steps_of(config, task)
     flags = [*COMMON.split(), *memory, *task.flags.split(), *(task.trxl_flags.split() if "trxl" in script else [])]
-    flags += ["--total-timesteps", str(task.total_timesteps), "--anneal-steps", str(task.total_timesteps)]
+    flags += ["--total-timesteps", str(steps), "--anneal-steps", str(steps)]
     flags += ["--env-id", task.env_id, "--env-options", json.dumps(task.options)]
-    flags += ["--exp-name", agent.replace(" ", "-"), "--seed", str(seed)]
+    flags += ["--exp-name", file_name(agent), "--seed", str(seed)]
     args = parsed(script, flags)
-    every = max(1, task.total_timesteps // (args.num_envs * args.num_steps) // evaluations)
+    every = max(1, steps // (args.num_envs * args.num_steps) // config.evaluations)
     return [sys.executable, str(ROOT / script), *flags, "--eval-interval", str(every)]
 
 
@@ -130,17 +156,23 @@ def parsed(script: str, flags: list[str]) -> Any:
     return importlib.import_module(Path(script).stem).parse_args(flags)
 
 
-def folder_of(config: Config, task: Task, agent: str, seed: int) -> str | None:
-    """Return the folder of such a run that came to its end, if there is one: it was evaluated then."""
-    wanted = arguments(command(task, agent, seed, config.evaluations))
-    for folder in sorted(glob.glob(f"{config.folder}/runs/{task.env_id}__{agent.replace(' ', '-')}__{seed}__*")):
+def folders_of(config: Config, task: Task, agent: str, seed: int) -> dict[str, bool]:
+    """Return the folders of such runs, and whether each came to its end: it was evaluated then."""
+    line, found = command(config, task, agent, seed), {}
+    wanted, args = arguments(line), parsed(Path(line[1]).name, line[2:])
+    for folder in sorted(glob.glob(f"{config.folder}/runs/{task.env_id}__{file_name(agent)}__{seed}__*")):
         run = EventAccumulator(folder, size_guidance={"scalars": 0})
         run.Reload()
-        if f"eval/{task.metric}" not in run.Tags()["scalars"] or evaluate.hyperparameters(run) != wanted:
-            continue
-        if run.Scalars(f"eval/{task.metric}")[-1].step > 0.99 * task.total_timesteps:
-            return folder
-    return None
+        if "hyperparameters/text_summary" in run.Tags()["tensors"] and evaluate.hyperparameters(run) == wanted:
+            evaluated = f"eval/{task.metric}" in run.Tags()["scalars"]
+            last = run.Scalars(f"eval/{task.metric}")[-1].step if evaluated else 0
+            found[folder] = last + args.num_envs * args.num_steps > steps_of(config, task)
+    return found
+
+
+def folder_of(config: Config, task: Task, agent: str, seed: int) -> str | None:
+    """Return the folder of such a run that came to its end, if there is one."""
+    return next((folder for folder, whole in folders_of(config, task, agent, seed).items() if whole), None)
 
 
 def arguments(line: list[str]) -> dict[str, str]:
@@ -150,12 +182,15 @@ def arguments(line: list[str]) -> dict[str, str]:
 
 
 def train(config: Config, task: Task, agent: str, seed: int) -> None:
-    """Run a training, its output in a file beside the runs; raise SystemExit that names the file if it fails."""
+    """Run a training, or go on with one that was stopped; raise SystemExit that names its output's file if it fails."""
+    line = command(config, task, agent, seed)
+    for folder in folders_of(config, task, agent, seed):
+        if glob.glob(f"{folder}/checkpoint-*.pt"):
+            line = [*line[:2], "--resume", os.path.relpath(folder, config.folder)]
     threads = str(max(1, (os.cpu_count() or 1) // config.jobs))
-    log = config.folder / f"{task.env_id}-{agent.replace(' ', '-')}-{seed}.log"
+    log = config.folder / f"{task.env_id}-{file_name(agent)}-{seed}.log"
     environment = {**os.environ, "OMP_NUM_THREADS": threads, "TQDM_MININTERVAL": "10"}
-    with log.open("w") as output:
-        line = command(task, agent, seed, config.evaluations)
+    with log.open("a") as output:
         if subprocess.run(line, cwd=config.folder, env=environment, stdout=output, stderr=output).returncode:
             raise SystemExit(f"{agent} on {task.env_id}, seed {seed}, failed: see {log}")
     print(f"trained {agent} on {task.env_id}, seed {seed}", flush=True)
@@ -193,7 +228,7 @@ def report(config: Config, name: str) -> None:
     task = TASKS[name]
     folders = {agent: [folder_of(config, task, agent, seed) for seed in config.seeds] for agent in config.agents}
     scores = [evaluate.iqm(np.stack([c[2][-1] for c in curves(each, task.metric)])) for each in folders.values()]
-    print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {task.total_timesteps:,} steps\n")
+    print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {steps_of(config, task):,} steps\n")
     print("| agent | seeds | mean | IQM | 95 % interval | steps to 0.9 of the best | seconds | seconds in all |")
     print("|---|---:|---:|---:|---|---:|---:|---:|")
     for agent, each in folders.items():
@@ -202,6 +237,8 @@ def report(config: Config, name: str) -> None:
 
 def main(config: Config) -> None:
     """Train what is missing, then print the tables and draw the curves."""
+    if config.steps_scale <= 0:
+        raise SystemExit(f"--steps-scale is {config.steps_scale}; it must be above 0")
     for given, known in ((config.tasks, TASKS), (config.agents, AGENTS)):
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"there is no {unknown[0]}; there are {', '.join(known)}")

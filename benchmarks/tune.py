@@ -27,7 +27,7 @@ pruner, since it compares a trial's best report so far with the other trials' re
 training is warm-up, for in Mystery Path little is learned before. Half of the trials are kept, where the thesis kept a
 quarter: the pruner compares with completed trials only, and these are the better ones.
 
-The tasks take --steps-scale 0.3 of their usual steps, 0.6 to 0.9 million: wanted is what learns a task in less than a
+The tasks take --steps-scale 0.6 of their usual steps, 0.6 to 0.9 million: wanted is what learns a task in less time
 third of the time that benchmarks/learning.py gives. Learning rate and entropy bonus decay over these steps, so that the
 end of a training shows what a small learning rate does. As in the thesis (6.1.1), a trial is not repeated with other
 seeds: the tasks are its repetitions. But the best of many noisy scores is partly luck. This trains the preset and the
@@ -144,7 +144,7 @@ class Config:
     """worker processes, one thread each"""
     tasks: tuple[str, ...] = tuple(TASKS)
     """of those that benchmarks/learning.py knows"""
-    steps_scale: float = 0.3
+    steps_scale: float = 0.6
     """share of a task's steps that a trial trains for"""
     seeds: tuple[int, ...] = (1,)
     """a trial trains with each of them on each task"""
@@ -373,12 +373,9 @@ def storage(config: Config) -> JournalStorage:
 def queue_killed_trials(study: optuna.Study, config: Config) -> None:
     """Mark the trials as failed that no process works on any more, and queue their parameters again."""
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-        path = lock_path(config, trial.number)
-        with contextlib.suppress(BlockingIOError):
-            if path.exists():  # else it is just being started
-                with locked(path, wait=False):
-                    study.tell(trial.number, state=TrialState.FAIL)
-                    study.enqueue_trial(trial.params, user_attrs=trial.user_attrs)
+        with contextlib.suppress(BlockingIOError), locked(lock_path(config, trial.number), wait=False):
+            study.tell(trial.number, state=TrialState.FAIL)
+            study.enqueue_trial(trial.params, user_attrs=trial.user_attrs)
 
 
 def work(config: Config, worker: int, until: float) -> None:
@@ -390,8 +387,10 @@ def work(config: Config, worker: int, until: float) -> None:
     try:
         while time.time() < until and len(study.get_trials(deepcopy=False, states=counted)) < config.trials:
             study.sampler = sampler(config, worker, len(study.get_trials(deepcopy=False)))
-            trial = study.ask(space_of(config.script))
-            with locked(lock_path(config, trial.number)):
+            with contextlib.ExitStack() as stack:
+                with locked(config.folder / "locks" / config.script):  # nobody sees a trial before it is locked
+                    trial = study.ask(space_of(config.script))
+                    stack.enter_context(locked(lock_path(config, trial.number)))
                 finish(study, trial, config)
     finally:
         os.chdir(before)

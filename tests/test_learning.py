@@ -1,0 +1,44 @@
+"""benchmarks/learning.py: its command lines, and which runs it need not train again."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
+import learning
+
+import ppo_gru
+
+
+@pytest.mark.parametrize("task", learning.TASKS)
+@pytest.mark.parametrize("agent", learning.AGENTS)
+def test_every_agent_s_command_can_be_parsed(task, agent):
+    line = learning.command(learning.Config(steps_scale=6), learning.TASKS[task], agent, 2)
+    args = learning.parsed(Path(line[1]).name, line[2:])
+    assert args.total_timesteps == args.anneal_steps == 6 * learning.TASKS[task].total_timesteps
+    assert args.refresh_memory == ("refreshed" in agent)
+    assert getattr(args, "trxl_memory_gradient", False) == ("gradient" in agent)
+    assert getattr(args, "trxl_gate", None) == {"TrXL": "none", "GTrXL": "gru"}.get(agent.split(",")[0])
+
+
+def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, capsys):
+    agent, task = "GRU, refreshed", learning.TASKS["mortar-mayhem"]
+    config = learning.Config(("mortar-mayhem",), (agent,), (1,), 0.005, evaluations=2)
+    config.folder, config.out = tmp_path / "learning", tmp_path / "curves"
+    config.folder.mkdir()
+    monkeypatch.chdir(config.folder)
+    args = ppo_gru.parse_args(learning.command(config, task, agent, 1)[2:])
+    run = ppo_gru.setup(args)
+    run.stop = True  # after the first of two iterations
+    ppo_gru.run_to_end(args, run)
+    assert [*learning.folders_of(config, task, agent, 1).values()] == [False]
+
+    learning.main(config)
+    assert f"trained {agent} on {task.env_id}, seed 1" in capsys.readouterr().out
+    assert learning.folders_of(config, task, agent, 1) == {str(config.folder / run.folder): True}
+    learning.main(config)
+    told = capsys.readouterr().out
+    assert "trained" not in told
+    assert f"| {agent} | 1 |" in told
+    assert config.out.with_suffix(".png").stat().st_size > 10_000
