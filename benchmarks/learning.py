@@ -163,7 +163,9 @@ def folders_of(config: Config, task: Task, agent: str, seed: int) -> dict[str, b
     for folder in sorted(glob.glob(f"{config.folder}/runs/{task.env_id}__{file_name(agent)}__{seed}__*")):
         run = EventAccumulator(folder, size_guidance={"scalars": 0})
         run.Reload()
-        if "hyperparameters/text_summary" in run.Tags()["tensors"] and evaluate.hyperparameters(run) == wanted:
+        if "hyperparameters/text_summary" not in run.Tags()["tensors"]:
+            continue  # stopped before its first step
+        if {**evaluate.hyperparameters(run), "resume": "None"} == wanted:
             evaluated = f"eval/{task.metric}" in run.Tags()["scalars"]
             last = run.Scalars(f"eval/{task.metric}")[-1].step if evaluated else 0
             found[folder] = last + args.num_envs * args.num_steps > steps_of(config, task)

@@ -27,11 +27,11 @@ pruner, since it compares a trial's best report so far with the other trials' re
 training is warm-up, for in Mystery Path little is learned before. Half of the trials are kept, where the thesis kept a
 quarter: the pruner compares with completed trials only, and these are the better ones.
 
-The tasks take --steps-scale 0.6 of their usual steps, 0.6 to 0.9 million: wanted is what learns a task in less time
-third of the time that benchmarks/learning.py gives. Learning rate and entropy bonus decay over these steps, so that the
-end of a training shows what a small learning rate does. As in the thesis (6.1.1), a trial is not repeated with other
-seeds: the tasks are its repetitions. But the best of many noisy scores is partly luck. This trains the preset and the
-best five of the search again with other seeds, for as many steps as benchmarks/learning.py does, and prunes none:
+The tasks take --steps-scale 0.6 of the steps that benchmarks/learning.py gives them, 0.6 to 0.9 million: wanted is what
+learns them sooner. Learning rate and entropy bonus decay over these steps, so that the end of a training shows what a
+small learning rate does. As in the thesis (6.1.1), a trial is not repeated with other seeds: the tasks are its
+repetitions. But the best of many noisy scores is partly luck. This trains the preset and the best five of the search
+again with other seeds, for as many steps as benchmarks/learning.py does, and prunes none:
 
     python benchmarks/tune.py --again tune --folder tune-again --trials 6 --seeds 2 3 4 --steps-scale 1 --keep 100
 

@@ -1,5 +1,6 @@
 """benchmarks/learning.py: its command lines, and which runs it need not train again."""
 
+import signal
 import sys
 from pathlib import Path
 
@@ -24,13 +25,15 @@ def test_every_agent_s_command_can_be_parsed(task, agent):
 
 def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, capsys):
     agent, task = "GRU, refreshed", learning.TASKS["mortar-mayhem"]
-    config = learning.Config(("mortar-mayhem",), (agent,), (1,), 0.005, evaluations=2)
+    small = "--num-envs 4 --num-steps 32 --num-minibatches 2 --hidden-size 8 --eval-levels 2 --eval-repeats 1"
+    monkeypatch.setattr(learning, "COMMON", f"{learning.COMMON} {small}")
+    config = learning.Config(("mortar-mayhem",), (agent,), 3 * 128 / task.total_timesteps, (1,), evaluations=3)
     config.folder, config.out = tmp_path / "learning", tmp_path / "curves"
     config.folder.mkdir()
     monkeypatch.chdir(config.folder)
     args = ppo_gru.parse_args(learning.command(config, task, agent, 1)[2:])
     run = ppo_gru.setup(args)
-    run.stop = True  # after the first of two iterations
+    run.received_signal = signal.SIGTERM  # during the first of three iterations
     ppo_gru.run_to_end(args, run)
     assert [*learning.folders_of(config, task, agent, 1).values()] == [False]
 
