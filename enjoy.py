@@ -152,7 +152,7 @@ def attention_of(memory: ppo_trxl.Memory, x: Tensor, state: ppo_trxl.MemoryState
     """Return what the next step, x (N, D), attends to: weights (N, K, H, M) of the last M steps, the oldest first."""
     rows, age, seen = memory.look_back(state)
     x, found = x[:, None], []  # (N, 1, D)
-    in_query = memory.in_query(state.episode_step[:, None], state.items[state.now - 1, :, -1:], x.dtype)
+    in_query = memory.in_query(state.episode_step[:, None], state.items[state.now - 1][:, None], x.dtype)
     for k, block in enumerate(memory.blocks):
         added = in_query if k == 0 else 0.0
         keys_values = state.keys[k][:, rows], state.values[k][:, rows]

@@ -200,7 +200,8 @@ class Args:
     ground_truth_detach: bool = False
     """estimate it without teaching the agent: a probe of what its memory holds"""
     embedding: bool = True
-    """embed the encoded observation in the memory's width (without, a GRU or LSTM takes it as it is)"""
+    """embed the encoded observation in the memory's width; without, the memory takes it as it is (a transformer only if
+    --trxl-dim is its width)"""
     head_size: PositiveInt = 512
     """width of the layer after the memory, and of the heads' own layers"""
 
@@ -879,11 +880,11 @@ def update(
         rollout.advantages = normalize(rollout.advantages)
     observations = UniqueObservations(rollout.obs, agent)
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
-    # What is detached is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
-    probes = ["estimator."] * args.ground_truth_detach + ["decoder."] * args.reconstruction_detach
-    probe, parameters = [], []
-    for name, parameter in agent.named_parameters():
-        (probe if name.startswith(tuple(probes)) else parameters).append(parameter)
+    # A detached head is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
+    heads = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
+    probes = [[*head.parameters()] for head, detached in heads if head is not None and detached]
+    apart = {parameter for probe in probes for parameter in probe}
+    parameters = [parameter for parameter in agent.parameters() if parameter not in apart]
     logs = []
     for epoch in range(args.update_epochs):
         if args.refresh_memory and epoch > 0:
@@ -894,8 +895,8 @@ def update(
             loss.backward()
             average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
             log["grad_norm"] = nn.utils.clip_grad_norm_(parameters, args.max_grad_norm)
-            probe_norm = nn.utils.clip_grad_norm_(probe, args.max_grad_norm)
-            if not (log["loss"] + log["grad_norm"] + probe_norm).isfinite():
+            probe_norms = sum(nn.utils.clip_grad_norm_(probe, args.max_grad_norm) for probe in probes)
+            if not (log["loss"] + log["grad_norm"] + probe_norms).isfinite():
                 raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
             optimizer.step()
             logs.append(log)
@@ -1410,11 +1411,17 @@ def state_of_process(run: Run) -> dict[str, Any]:
 def load_checkpoint(run: Run, saved: dict[str, Any]) -> None:
     """Set a run that was just made to what `save_checkpoint` wrote: it goes on as if it had never stopped.
 
-    Environments of other packages begin new episodes, with a line that says so. Raises ValueError if weights or
-    environments do not fit.
+    Environments of other packages begin new episodes, with a line that says so. Raises ValueError if weights, optimizer
+    or environments do not fit.
     """
     load_weights(run.agent, saved, run.folder)
     run.optimizer.load_state_dict(saved["optimizer"])
+    for weight, moments in run.optimizer.state.items():
+        if moments["exp_avg"].shape != weight.shape:  # torch tells the weights apart by their order alone
+            raise ValueError(
+                f"{run.folder}: its checkpoint is of a version with the weights in another order, and training cannot "
+                "go on from it; --load-model takes its weights"
+            )
     run.step, run.seconds = saved["step"], saved["seconds"]
     run.returns.extend(saved["returns"])
     run.lengths.extend(saved["lengths"])
@@ -1511,7 +1518,10 @@ def read_model(path: str | Path) -> dict[str, Any]:
 def saved_args(saved: dict[str, Any]) -> Args:
     """Return the arguments in what `read_model` read; a flag that is newer than the file has its default."""
     known = {each.name for each in fields(Args)}
-    return Args(**{name: value for name, value in saved["args"].items() if name in known})
+    given = {name: value for name, value in saved["args"].items() if name in known}
+    if isinstance(given.get("norm_adv"), bool):  # before it was a choice
+        given["norm_adv"] = "minibatch" if given["norm_adv"] else "none"
+    return Args(**given)
 
 
 def load_weights(agent: Agent, saved: dict[str, Any], path: str | Path) -> None:

@@ -203,7 +203,8 @@ class Args:
     ground_truth_detach: bool = False
     """estimate it without teaching the agent: a probe of what its memory holds"""
     embedding: bool = True
-    """embed the encoded observation in the memory's width (without, a GRU or LSTM takes it as it is)"""
+    """embed the encoded observation in the memory's width; without, the memory takes it as it is (a transformer only if
+    --trxl-dim is its width)"""
     head_size: PositiveInt = 512
     """width of the layer after the memory, and of the heads' own layers"""
 
@@ -673,8 +674,8 @@ class Block(nn.Module):
         super().__init__()
         width = args.trxl_dim
         before, after = (nn.LayerNorm, nn.Identity) if args.trxl_layer_norm == "pre" else (nn.Identity, nn.LayerNorm)
-        self.norm_query, self.norm_items, self.norm_hidden = before(width), before(width), before(width)
-        self.norm_attended, self.norm_output = after(width), after(width)
+        self.norm_query, self.norm_items, self.norm_output = before(width), before(width), before(width)
+        self.after_attention, self.after_projection = after(width), after(width)
         self.attention = Attention(width, args.trxl_num_heads, args.trxl_positional_encoding == "relative")
         self.projection = nn.Linear(width, width)
         if args.trxl_gate == "gru":
@@ -690,9 +691,9 @@ class Block(nn.Module):
     def forward(self, x: Tensor, in_query: Tensor | float, keys_values: tuple, age: Tensor, seen: Tensor) -> Tensor:
         """Map x (S, L, D) to the next block's input (S, L, D); `in_query` (S, L, D) is added for the query alone."""
         x = self.merge_attention(x, self.attention(self.norm_query(x + in_query), *keys_values, age, seen))
-        x = self.norm_attended(x)
-        x = self.merge_output(x, F.relu(self.projection(self.norm_hidden(x))))
-        return self.norm_output(x)
+        x = self.after_attention(x)
+        x = self.merge_output(x, F.relu(self.projection(self.norm_output(x))))
+        return self.after_projection(x)
 
 
 def block_init(block: Block, scheme: str, blocks: int) -> None:
@@ -722,7 +723,7 @@ class MemoryState(NamedTuple):
 
     now: int  # row of the step that comes next
     episode_step: Tensor  # (N,) which step of its episode that is
-    items: Tensor  # (W + T + 1, N, K, D) the input of every block, K; with --trxl-query-output also the output
+    items: Tensor  # (W + T + 1, N, K or K + 1, D) the input of every block; with --trxl-query-output the output
     item_steps: Tensor  # (W + T + 1, N) which step of its episode an item was stored at
     keys: Tensor  # (K, N, W + T + 1, D) the items' projections, cached while acting
     values: Tensor  # (K, N, W + T + 1, D)
@@ -732,8 +733,8 @@ class Memory(nn.Module):
     """Transformer-XL as an episodic memory with a sliding window (§5.3), or GTrXL.
 
     Every step leaves an item, the inputs of the K blocks. A step's query in block k sees the k-th part of the items of
-    up to W steps before it, of the same episode, never its own. `inputs` and the width are one. Raises ValueError for a
-    width that does not suit.
+    up to W steps before it, of the same episode, never its own. Raises ValueError unless `inputs` is --trxl-dim, even
+    and a multiple of --trxl-num-heads.
     """
 
     not_saved = ("keys", "values")  # in checkpoints: every rollout computes them before they are read
@@ -798,7 +799,7 @@ class Memory(nn.Module):
         rows, age, seen = self.look_back(state)
         episode_step = state.episode_step.to(x.device)[:, None]  # (N, 1)
         position = self.position(episode_step, x.dtype)  # (N, 1, D)
-        in_query = self.in_query(episode_step, state.items[state.now - 1, :, -1:], x.dtype)
+        in_query = self.in_query(episode_step, state.items[state.now - 1][:, None], x.dtype)
         state.item_steps[state.now] = state.episode_step
         x = x[:, None]  # (N, 1, D)
         for k, block in enumerate(self.blocks):
@@ -808,7 +809,7 @@ class Memory(nn.Module):
             window = state.keys[k][:, rows], state.values[k][:, rows]  # (N, M, D) each
             x = block(x, in_query if k == 0 else 0.0, window, age, seen)
         if self.query_output is not None:
-            state.items[state.now, :, -1:] = x
+            state.items[state.now, :, -1] = x[:, 0].detach()
         return x[:, 0], state._replace(now=state.now + 1, episode_step=state.episode_step + 1)
 
     def look_back(self, state: MemoryState) -> tuple[slice, Tensor, Tensor]:
@@ -870,7 +871,7 @@ class Memory(nn.Module):
         used = seen.any(1)  # (S, M); what no query sees becomes zero, so that not even a NaN in it has an effect
         items, item_steps = items.masked_fill(~used[..., None, None], 0.0), item_steps.where(used, 0)
         position = self.position(item_steps, x.dtype)  # (S, M, D)
-        in_query = self.in_query(episode_step, items[:, before - 1 :, -1], x.dtype)
+        in_query = self.in_query(episode_step, items[:, before - 1 :], x.dtype)
         for k, block in enumerate(self.blocks):
             block_items = items[:, :, k]
             if self.memory_gradient:
@@ -886,18 +887,19 @@ class Memory(nn.Module):
             return self.table[episode_step]
         return sinusoid(episode_step, self.width).to(dtype) if self.encoding == "absolute" else 0.0
 
-    def in_query(self, episode_step: Tensor, output_before: Tensor, dtype: torch.dtype) -> Tensor | float:
-        """Return what the first block's query (S, L, D) has beside its observation (§7.1.3).
+    def in_query(self, episode_step: Tensor, items_before: Tensor, dtype: torch.dtype) -> Tensor | float:
+        """Return what is added to the first block's query (S, L, D) at these steps (S, L) of their episodes (§7.1.3).
 
-        That is the encoding of its own step, episode_step (S, L), and a projection of the last block's output of the
-        step before, output_before (S, L, D), each if wanted.
+        With --trxl-query-position the encoding of the step; with --trxl-query-output a projection of the last block's
+        output of the step before, which is the last part of that step's items (S, L, K + 1, D).
         """
         added = 0.0
         if self.query_position:
             learned = self.encoding == "learned"
             added = self.table[episode_step] if learned else sinusoid(episode_step, self.width).to(dtype)
         if self.query_output is not None:
-            added = added + self.query_output(output_before.masked_fill(episode_step[..., None] == 0, 0.0))
+            output_before = items_before[..., -1, :].masked_fill(episode_step[..., None] == 0, 0.0)
+            added = added + self.query_output(output_before)
         return added
 
     def check_length(self, episode_step: Tensor) -> None:
@@ -1152,11 +1154,11 @@ def update(
         rollout.advantages = normalize(rollout.advantages)
     observations = UniqueObservations(rollout.obs, agent)
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
-    # What is detached is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
-    probes = ["estimator."] * args.ground_truth_detach + ["decoder."] * args.reconstruction_detach
-    probe, parameters = [], []
-    for name, parameter in agent.named_parameters():
-        (probe if name.startswith(tuple(probes)) else parameters).append(parameter)
+    # A detached head is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
+    heads = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
+    probes = [[*head.parameters()] for head, detached in heads if head is not None and detached]
+    apart = {parameter for probe in probes for parameter in probe}
+    parameters = [parameter for parameter in agent.parameters() if parameter not in apart]
     logs = []
     for epoch in range(args.update_epochs):
         if args.refresh_memory and epoch > 0:
@@ -1167,8 +1169,8 @@ def update(
             loss.backward()
             average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
             log["grad_norm"] = nn.utils.clip_grad_norm_(parameters, args.max_grad_norm)
-            probe_norm = nn.utils.clip_grad_norm_(probe, args.max_grad_norm)
-            if not (log["loss"] + log["grad_norm"] + probe_norm).isfinite():
+            probe_norms = sum(nn.utils.clip_grad_norm_(probe, args.max_grad_norm) for probe in probes)
+            if not (log["loss"] + log["grad_norm"] + probe_norms).isfinite():
                 raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
             optimizer.step()
             logs.append(log)
@@ -1683,11 +1685,17 @@ def state_of_process(run: Run) -> dict[str, Any]:
 def load_checkpoint(run: Run, saved: dict[str, Any]) -> None:
     """Set a run that was just made to what `save_checkpoint` wrote: it goes on as if it had never stopped.
 
-    Environments of other packages begin new episodes, with a line that says so. Raises ValueError if weights or
-    environments do not fit.
+    Environments of other packages begin new episodes, with a line that says so. Raises ValueError if weights, optimizer
+    or environments do not fit.
     """
     load_weights(run.agent, saved, run.folder)
     run.optimizer.load_state_dict(saved["optimizer"])
+    for weight, moments in run.optimizer.state.items():
+        if moments["exp_avg"].shape != weight.shape:  # torch tells the weights apart by their order alone
+            raise ValueError(
+                f"{run.folder}: its checkpoint is of a version with the weights in another order, and training cannot "
+                "go on from it; --load-model takes its weights"
+            )
     run.step, run.seconds = saved["step"], saved["seconds"]
     run.returns.extend(saved["returns"])
     run.lengths.extend(saved["lengths"])
@@ -1784,7 +1792,10 @@ def read_model(path: str | Path) -> dict[str, Any]:
 def saved_args(saved: dict[str, Any]) -> Args:
     """Return the arguments in what `read_model` read; a flag that is newer than the file has its default."""
     known = {each.name for each in fields(Args)}
-    return Args(**{name: value for name, value in saved["args"].items() if name in known})
+    given = {name: value for name, value in saved["args"].items() if name in known}
+    if isinstance(given.get("norm_adv"), bool):  # before it was a choice
+        given["norm_adv"] = "minibatch" if given["norm_adv"] else "none"
+    return Args(**given)
 
 
 def load_weights(agent: Agent, saved: dict[str, Any], path: str | Path) -> None:

@@ -52,11 +52,12 @@ def timeline(axis: Axes, rows: dict[str, float], cuts: list[int], piece: str) ->
     axis.text(EPISODE - 0.4, top, "a new episode", va="top", fontsize=9)
 
 
-def legend(figure: Figure) -> None:
-    """Say what the colors stand for."""
+def legend(figure: Figure, gray: str) -> None:
+    """Say what the colors stand for; gray: what a gray arrow does."""
     names = {"computed now": FRESH, "stored in this rollout": STORED, "stored before": OLD, "not used": UNUSED}
     handles = [Patch(facecolor=color, edgecolor=EDGE, label=name) for name, color in names.items()]
     handles.append(Line2D([], [], color=GRADIENT, linewidth=2, label="gradient"))
+    handles.append(Line2D([], [], color=EDGE, linewidth=2, label=gray))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, frameon=False)
 
 
@@ -76,33 +77,33 @@ def recurrent() -> Figure:
             if step > ROLLOUT:
                 arrow(axis, (step - 0.1, 0.68), (step - 0.9, 0.68), GRADIENT, 0.5)
     axis.text(EPISODE - 0.5, 0.4, "0", ha="center", va="center", fontsize=9)
-    legend(figure)
+    legend(figure, "goes on to the next step")
     return figure
 
 
 def transformer() -> Figure:
     """Draw what a query of either of two segments sees, and what it teaches with --trxl-memory-gradient."""
-    figure = Figure(figsize=(11, 6), layout="constrained")
+    figure = Figure(figsize=(11, 8), layout="constrained")
     cuts, window = [ROLLOUT, ROLLOUT + 6], 5
     for axis, query in zip(figure.subplots(2), (ROLLOUT + 3, ROLLOUT + 7), strict=True):
         segment = max(cut for cut in cuts if cut <= query)
         axis.set_title(
-            f"TrXL, two blocks, window of {window}, segments of 6: what step {query} looks at, and teaches with "
-            "--trxl-memory-gradient",
+            f"TrXL with --trxl-memory-gradient, two blocks, window of {window}, segments of 6: "
+            f"what step {query} looks at, and what it teaches",
             fontsize=11,
         )
-        timeline(axis, {"input of block 1": 0.4, "input of block 2": 1.8}, cuts, "segment")
-        for height in (0.4, 1.8):
+        rows = {"input of block 1": 0.4, "input of block 2": 2.0, "output of block 2": 3.6}
+        timeline(axis, rows, cuts, "segment")
+        for height, above in pairwise(rows.values()):
             for step in range(FIRST, END):
                 color = FRESH if step >= segment else STORED if step >= ROLLOUT else OLD
-                seen = query - window <= step < query
-                box(axis, (step, height), color if seen or step == query else UNUSED)
+                seen = query - window <= step <= query
+                box(axis, (step, height), color if seen else UNUSED)
                 if seen:
-                    end = (step + 0.1, height + 0.28)
-                    bend = 0.12 + 0.3 / (query - step)
-                    arrow(axis, (query - 0.1, height + 0.28), end, GRADIENT if step >= segment else EDGE, bend)
-        arrow(axis, (query, 1.5), (query, 0.7), GRADIENT)
-    legend(figure)
+                    end = (step + 0.15 * (query > step), height + 0.28)
+                    arrow(axis, (query, above - 0.28), end, GRADIENT if step >= segment else EDGE)
+        box(axis, (query, rows["output of block 2"]), FRESH)
+    legend(figure, "looks at, without gradient")
     return figure
 
 

@@ -31,7 +31,7 @@ def tiny():
     """Arguments of a script for a training of two short iterations; keyword arguments replace some of them."""
 
     def make(script=ppo_gru, **changes):
-        few = {"num_envs": 4, "num_steps": 16, "num_minibatches": 2, "update_epochs": 2, "head_size": 32, **SMALL[script]}
+        few = {"num_envs": 4, "num_steps": 16, "num_minibatches": 2, "update_epochs": 2, **SMALL[script]}
         return script.Args(**{"cuda": False, "total_timesteps": 128, **few, **changes})
 
     return make

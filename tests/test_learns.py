@@ -10,7 +10,7 @@ STEPS = 30 * 32 * 52  # 30 iterations
 BATCH = {"num_envs": 32, "num_steps": 52, "num_minibatches": 4, "update_epochs": 6, "total_timesteps": STEPS}
 RATES = {"init_lr": 2e-3, "final_lr": 1e-4, "init_ent_coef": 1e-2, "final_ent_coef": 1e-3, "anneal_steps": STEPS}
 LIMITS = {"clip_coef": 0.2, "max_grad_norm": 0.5, "target_kl": 0.02}
-SETTINGS = {**BATCH, **RATES, **LIMITS, "env_id": "CueRecall-v0", "gamma": 0.99, "head_size": 512}
+SETTINGS = {**BATCH, **RATES, **LIMITS, "env_id": "CueRecall-v0", "gamma": 0.99}
 WINDOW = {"trxl_num_layers": 1, "trxl_memory_length": 16, "trxl_segment_length": 52}
 
 
@@ -36,7 +36,7 @@ def test_transformer_memory(tiny, scalars, encoding, gate):
 @pytest.mark.slow
 @pytest.mark.parametrize("faster", ["amp", "compile"])
 def test_with_bfloat16_or_compiled(tiny, scalars, faster):
-    # Rounding differs from processor to processor, and with it when the task is solved: 40 iterations instead of 30.
-    longer = {**SETTINGS, "total_timesteps": STEPS * 4 // 3, "anneal_steps": STEPS * 4 // 3}
+    # Rounding differs from processor to processor, and with it when the task is solved: 50 iterations instead of 30.
+    longer = {**SETTINGS, "total_timesteps": STEPS * 5 // 3, "anneal_steps": STEPS * 5 // 3}
     for script, memory in ((ppo_gru, {"hidden_size": 64}), (ppo_trxl, WINDOW)):
         assert final_return(scalars, script, tiny(script, **{faster: True}, **memory, **longer)) >= 0.95

@@ -41,6 +41,10 @@ RUNS = {
         "script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "learned", "trxl_query_position": True
     },
     "TrXL, relative": {"script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "relative", "trxl_segment_length": 5},
+    "TrXL, output in the query": {
+        "script": ppo_trxl, **ENDLESS, "trxl_query_output": True, "trxl_layer_norm": "post"
+    },
+    "GRU, no embedding": {**GRID, "embedding": False},
     "TrXL, no encoding": {"script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "none"},
     "GTrXL, pixels, evaluations": {
         "script": ppo_trxl, "env_id": "MortarMayhem-Grid-v0", "trxl_gate": "gru", "eval_interval": 1, "eval_levels": 1,
@@ -318,6 +322,18 @@ def test_a_folder_that_cannot_be_written(trained, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: not (path == trained and mode == os.W_OK))
     with pytest.raises(OSError, match=f"--resume {trained}: this folder cannot be written"):
         resumed(ppo_gru, trained)
+
+
+def test_a_checkpoint_with_the_weights_in_another_order(trained):
+    path = trained / "checkpoint-128.pt"
+    saved = ppo_gru.read_model(path)
+    moments = saved["optimizer"]["state"]
+    saved["optimizer"]["state"] = {i: moments[(i + 1) % len(moments)] for i in moments}
+    torch.save(saved, path)
+    with pytest.raises(ValueError, match=r"of a version with the weights in another order, .*; --load-model takes"):
+        resumed(ppo_gru, trained, "--total-timesteps", "256")
+    torch.save({**saved, "args": saved["args"] | {"norm_adv": True}}, path)
+    assert ppo_gru.saved_args(ppo_gru.read_model(path)).norm_adv == "minibatch", "as it was before it was a choice"
 
 
 def test_weights_alone_are_no_checkpoint(trained):

@@ -179,7 +179,7 @@ def test_a_search_ends_goes_on_and_reports(monkeypatch, capsys):
     preset = tune.preset_params("ppo_gru") | {"layout": "4x16", "num_minibatches": 2}
     monkeypatch.setattr(tune, "SPACE", tune.SPACE | small)
     monkeypatch.setattr(tune, "preset_params", lambda script: preset)
-    config = tune.Config(trials=2, steps_scale=0.0001, folder=Path("search"))
+    config = tune.Config(trials=2, steps_scale=0.0002, folder=Path("search"))
     tune.main(config)
     assert "2 complete" in capsys.readouterr().out
     before = trials_of(config)
@@ -276,7 +276,7 @@ def test_draws_differ_from_trial_to_trial_and_from_worker_to_worker(quick):
     [
         ({"trials": 0}, "--trials is 0; it must be 1 or more"),
         ({"hours": -1.0}, "--hours is -1.0; it must be above 0"),
-        ({"steps_scale": 0.001}, "--steps-scale is 0.001; it must be 0.0041 or more"),
+        ({"steps_scale": 0.001}, "--steps-scale is 0.001; it must be 0.00819 or more"),
         ({"keep": 0.0}, "--keep is 0.0"),
         ({"sampler_seed": -1}, "--sampler-seed and --seeds must be 0 or more"),
         ({"seeds": (1, -1)}, "--sampler-seed and --seeds must be 0 or more"),

@@ -53,7 +53,7 @@ def naive(memory, x, row, lane, stored, own=None):
     step = int(stored.item_steps[row, lane])
     window = min(step, memory.window)
     at = torch.arange(row - window, row)
-    told = memory.in_query(stored.item_steps[row, lane], torch.zeros_like(x), x.dtype)
+    told = memory.in_query(stored.item_steps[row, lane], torch.zeros_like(stored.items[row, lane]), x.dtype)
     if memory.query_output is not None and step > 0:
         told = told + memory.query_output.weight @ stored.items[row - 1, lane, -1]
     inputs = []
@@ -81,10 +81,10 @@ def naive(memory, x, row, lane, stored, own=None):
         attended = attention.output(torch.cat(heads)) if window else torch.zeros_like(x)
         x = block.merge_attention(x, attended)
         if isinstance(block.norm_query, torch.nn.LayerNorm):
-            x = block.merge_output(x, F.relu(block.projection(block.norm_hidden(x))))
+            x = block.merge_output(x, F.relu(block.projection(block.norm_output(x))))
         else:
-            x = block.norm_attended(x)
-            x = block.norm_output(block.merge_output(x, F.relu(block.projection(x))))
+            x = block.after_attention(x)
+            x = block.after_projection(block.merge_output(x, F.relu(block.projection(x))))
     if own is not None:
         own.append(inputs)
     return x
