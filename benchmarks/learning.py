@@ -113,7 +113,7 @@ class Config:
     tasks: tuple[str, ...] = ("mortar-mayhem", "mystery-path")
     """of those that this program knows"""
     agents: tuple[str, ...] = ("no memory", "stack of 4", "GRU", "TrXL")
-    """of those that this program knows"""
+    """of those that this program knows, each alone or with further flags, e.g. "TrXL --trxl-num-layers 3" """
     steps_scale: float = 1.0
     """share of a task's steps to train for"""
     seeds: tuple[int, ...] = (1, 2, 3)
@@ -140,9 +140,11 @@ def file_name(agent: str) -> str:
 
 def command(config: Config, task: Task, agent: str, seed: int) -> list[str]:
     """Return the command line of a training run."""
-    script, *memory = AGENTS[agent].split()
+    name, dashes, further = agent.partition(" --")
+    script, *memory = AGENTS[name].split()
     steps = steps_of(config, task)
     flags = [*COMMON.split(), *memory, *task.flags.split(), *(task.trxl_flags.split() if "trxl" in script else [])]
+    flags += f"{dashes}{further}".split()
     flags += ["--total-timesteps", str(steps), "--anneal-steps", str(steps)]
     flags += ["--env-id", task.env_id, "--env-options", json.dumps(task.options)]
     flags += ["--exp-name", file_name(agent), "--seed", str(seed)]
@@ -241,7 +243,7 @@ def main(config: Config) -> None:
     """Train what is missing, then print the tables and draw the curves."""
     if config.steps_scale <= 0:
         raise SystemExit(f"--steps-scale is {config.steps_scale}; it must be above 0")
-    for given, known in ((config.tasks, TASKS), (config.agents, AGENTS)):
+    for given, known in ((config.tasks, TASKS), ([agent.partition(" --")[0] for agent in config.agents], AGENTS)):
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"there is no {unknown[0]}; there are {', '.join(known)}")
     config.folder.mkdir(parents=True, exist_ok=True)

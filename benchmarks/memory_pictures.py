@@ -1,9 +1,8 @@
 """Draw the pictures of docs/memory.md: where the gradient of an update flows, and what it takes as it was stored.
 
-python benchmarks/memory_pictures.py docs
+    python benchmarks/memory_pictures.py
 """
 
-import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -109,4 +108,4 @@ def transformer() -> Figure:
 
 if __name__ == "__main__":
     for name, draw in (("memory_gru", recurrent), ("memory_trxl", transformer)):
-        draw().savefig(Path(sys.argv[1]) / f"{name}.png", dpi=110)
+        draw().savefig(Path(__file__).parent.parent / "docs" / f"{name}.png", dpi=110)

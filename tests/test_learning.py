@@ -23,6 +23,18 @@ def test_every_agent_s_command_can_be_parsed(task, agent):
     assert getattr(args, "trxl_gate", None) == {"TrXL": "none", "GTrXL": "gru"}.get(agent.split(",")[0])
 
 
+def test_an_agent_may_have_further_flags(tmp_path):
+    task = learning.TASKS["mystery-path"]
+    agent = "TrXL, gradient --trxl-num-layers 3 --trxl-positional-encoding learned"
+    line = learning.command(learning.Config(), task, agent, 1)
+    args = learning.parsed(Path(line[1]).name, line[2:])
+    assert args.trxl_memory_gradient
+    assert (args.trxl_num_layers, args.trxl_positional_encoding) == (3, "learned")  # the task's own flags come first
+    assert args.exp_name == "TrXL-gradient-trxl-num-layers-3-trxl-positional-encoding-learned"
+    with pytest.raises(SystemExit, match="there is no TrXXL; there are no memory, stack of 4, GRU"):
+        learning.main(learning.Config(agents=("GRU", "TrXXL --trxl-num-layers 3"), folder=tmp_path))
+
+
 def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, capsys):
     agent, task = "GRU, refreshed", learning.TASKS["mortar-mayhem"]
     small = "--num-envs 4 --num-steps 32 --num-minibatches 2 --hidden-size 8 --eval-levels 2 --eval-repeats 1"
