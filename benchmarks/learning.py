@@ -201,29 +201,28 @@ def train(config: Config, task: Task, agent: str, seed: int) -> None:
 
 
 def curves(folders: list[str], metric: str) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield, of each run's evaluations, the steps (P,), the seconds since it began (P,), and the levels' scores (P, M).
+    """Yield, of each run's evaluations, the steps (P,), the hours of training until then (P,), and the levels' scores.
 
-    The seconds include the evaluations.
+    The hours are without evaluations, the scores (P, M).
     """
     for folder in folders:
         run = evaluate.read_run(folder)
         steps, scores = evaluate.read_curve(run, f"eval/{metric}")
-        began = run.Tensors("hyperparameters/text_summary")[0].wall_time
-        yield steps, np.array([point.wall_time - began for point in run.Scalars(f"eval/{metric}")]), scores
+        yield steps, evaluate.training_hours(run, steps), scores
 
 
 def row(agent: str, folders: list[str], metric: str, best: float) -> str:
     """Return the agent's row: its last score, and what it took to nine tenths of the best score of all agents."""
-    steps, seconds, scores = map(np.stack, zip(*curves(folders, metric), strict=True))  # (R, P), (R, P), (R, P, M)
+    steps, hours, scores = map(np.stack, zip(*curves(folders, metric), strict=True))  # (R, P), (R, P), (R, P, M)
     last, ends = evaluate.iqm(scores[:, -1]), evaluate.interval(scores[:, -1])
     middle = evaluate.iqm(scores.swapaxes(0, 1))  # (P,)
     reached = np.flatnonzero(middle >= 0.9 * best)
     taken = ("never", "")
     if reached.size:
-        taken = (f"{steps[0, reached[0]]:,.0f}", f"{seconds[:, reached[0]].mean():.0f}")
+        taken = (f"{steps[0, reached[0]]:,.0f}", f"{60 * hours[:, reached[0]].mean():.1f}")
     mean = scores[:, -1].mean()
     span = "none: one seed" if ends is None else "{:.2f} to {:.2f}".format(*ends)
-    whole = f"{seconds[:, -1].mean():.0f}"
+    whole = f"{60 * hours[:, -1].mean():.1f}"
     return f"| {agent} | {len(folders)} | {mean:.2f} | {last:.2f} | {span} | {taken[0]} | {taken[1]} | {whole} |"
 
 
@@ -233,7 +232,7 @@ def report(config: Config, name: str) -> None:
     folders = {agent: [folder_of(config, task, agent, seed) for seed in config.seeds] for agent in config.agents}
     scores = [evaluate.iqm(np.stack([c[2][-1] for c in curves(each, task.metric)])) for each in folders.values()]
     print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {steps_of(config, task):,} steps\n")
-    print("| agent | seeds | mean | IQM | 95 % interval | steps to 0.9 of the best | seconds | seconds in all |")
+    print("| agent | seeds | mean | IQM | 95 % interval | steps to 0.9 of the best | minutes | minutes in all |")
     print("|---|---:|---:|---:|---|---:|---:|---:|")
     for agent, each in folders.items():
         print(row(agent, each, task.metric, float(max(scores))))

@@ -1,6 +1,6 @@
 """Draw the pictures of docs/memory.md: where the gradient of an update flows, and what it takes as it was stored.
 
-    python benchmarks/memory_pictures.py
+python benchmarks/memory_pictures.py
 """
 
 from itertools import pairwise
