@@ -101,9 +101,10 @@ def test_every_kind_of_agent(name, saved):
         assert len(branch["actions"]) == len(branch["probabilities"][0])
 
 
-def test_the_episode_is_the_agents(saved):
+@pytest.mark.parametrize("flags", [{}, {"trxl_query_output": True, "trxl_query_position": True}], ids=str)
+def test_the_episode_is_the_agents(flags, saved):
     """Played again with the agent's own `act`: the same pictures, numbers and attention, step for step."""
-    saved(ppo_trxl, env_id="MortarMayhem-Grid-v0")
+    saved(ppo_trxl, env_id="MortarMayhem-Grid-v0", **flags)
     agent, envs, _ = enjoy.load("model.pt")
     episode = enjoy.play(agent, envs, 3, None, 60)
     page = enjoy.page_data(episode, "MortarMayhem-Grid-v0", {})

@@ -279,9 +279,9 @@ def test_the_drawn_example():
 
 @pytest.mark.parametrize("fill", [1e6, math.nan])
 @pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize("gradient", [False, True])
-def test_what_is_not_seen_changes_nothing(encoding, fill, gradient):
-    memory = make_memory(trxl_positional_encoding=encoding, trxl_memory_gradient=gradient)
+@pytest.mark.parametrize("flag", ["trxl_memory_gradient", "trxl_query_output", "trxl_query_position"])
+def test_what_is_not_seen_changes_nothing(encoding, fill, flag):
+    memory = make_memory(trxl_positional_encoding=encoding, **{flag: True})
     stored = make_timeline(memory)
     pieces = memory.cut(torch.zeros(STEPS, LANES, dtype=torch.bool))
     x = torch.randn(STEPS * LANES, WIDTH, dtype=torch.float64)
