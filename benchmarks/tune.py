@@ -116,6 +116,7 @@ OWN_SPACE = {
         "trxl_gate": one_of("none", "gru"),
         # Not the learned encoding of table 6.1: its table has an end, and an endless episode has none.
         "trxl_positional_encoding": one_of("absolute", "relative", "none"),
+        "trxl_query_position": one_of(False, True),
         "trxl_segment_length": one_of(16, 32, 64, 128),
         "trxl_memory_gradient": one_of(False, True),
         "trxl_init": one_of("xavier", "orthogonal", "kaiming", "tfixup"),  # table 6.1
@@ -343,6 +344,7 @@ def open_study(config: Config) -> optuna.Study:
             study.set_user_attr("search", wanted)
             queue_first_trials(study, config)
         found = study.user_attrs["search"]
+        found["search space"] = wanted["search space"] | found["search space"]  # it may have grown
         if differ := [name for name in wanted if found[name] != wanted[name]]:
             raise ValueError(f"{config.folder} holds a search with another {differ[0]}; use another --folder")
         queue_killed_trials(study, config)
@@ -494,7 +496,8 @@ def trials_table(trials: list[FrozenTrial], tasks: list[str]) -> str:
         rows[f"{name}: area, low"] = ["{:.2f}, {:.2f}".format(*pair) for pair in pairs]
     rows["minutes"] = [f"{trial.user_attrs['seconds'] / 60:.1f}" for trial in trials]
     found = [settings(trial.params) for trial in trials]
-    rows |= {f"`{flag(name)}`": [f"{each[name]}" for each in found] for name in found[0]}
+    # A parameter that came to the space later has an empty cell in earlier trials.
+    rows |= {f"`{flag(name)}`": [f"{each.get(name, '')}" for each in found] for each in found for name in each}
     lines = [["", *map(name_of, trials)], ["---", *["---:"] * len(trials)]]
     lines += [[name, *cells] for name, cells in rows.items()]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
@@ -554,7 +557,8 @@ def draw(study: optuna.Study, names: list[str], out: Path) -> None:
 
 
 def draw_parameter(axis: Axes, name: str, complete: list[FrozenTrial]) -> None:
-    """Draw the scores of complete trials against a parameter, later trials darker."""
+    """Draw the scores of complete trials that have a parameter against it, later trials darker."""
+    complete = [trial for trial in complete if name in trial.params]
     kind = complete[0].distributions[name]
     values = [trial.params[name] for trial in complete]
     if isinstance(kind, CategoricalDistribution):

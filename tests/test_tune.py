@@ -195,6 +195,19 @@ def test_a_search_ends_goes_on_and_reports(monkeypatch, capsys):
     assert Path("search/ppo_gru.png").stat().st_size > 10_000
 
 
+def test_a_search_goes_on_when_its_space_has_grown(quick, monkeypatch, capsys):
+    tune.main(quick)
+    monkeypatch.setattr(tune, "SPACE", {"hidden_size": tune.one_of(32, 64), **tune.SPACE})
+    tune.main(replace(quick, trials=4))
+    assert {"hidden_size" in trial.params for trial in trials_of(quick)} == {False, True}
+    row = capsys.readouterr().out.split("`--hidden-size` |")[1].splitlines()[0]
+    assert {*row.replace(" ", "").split("|")[:-1]} - {"32", "64"} == {""}
+    changed = tune.SPACE | {"gamma": tune.one_of(0.9, 0.99)}
+    monkeypatch.setattr(tune, "SPACE", changed)
+    with pytest.raises(ValueError, match="another search space; use another --folder"):
+        tune.main(replace(quick, trials=5))
+
+
 def test_a_search_finds_what_is_better_and_prunes_what_is_worse(quick, capsys):
     config = replace(quick, trials=24)
     tune.main(config)
