@@ -119,8 +119,8 @@ def interval(scores: np.ndarray) -> np.ndarray | None:
     """Return the ends (2, ...) of the IQM's 95 % bootstrap interval for scores (..., R, M); None for a single seed.
 
     Levels are the strata: a resample has R scores of each. A drawn seed brings its scores on all levels along, for they
-    come from the same weights. To draw anew for each level is right where each has been trained on by itself; here it
-    makes the interval far too narrow wherever seeds differ, as benchmarks/interval_coverage.py shows.
+    come from the same weights. To draw other seeds for each level is right where each has been trained on by itself;
+    here it makes the interval far too narrow wherever seeds differ, as benchmarks/interval_coverage.py shows.
     """
     seeds = scores.shape[-2]
     if seeds < 2:
@@ -242,6 +242,8 @@ def hyperparameters(events: EventAccumulator) -> dict[str, str]:
     """
     rows = events.Tensors("hyperparameters/text_summary")[-1].tensor_proto.string_val[0].decode().splitlines()[2:]
     given = dict(row[1:-1].split("|", 1) for row in rows)
+    if given.get("norm_adv") in ("True", "False"):  # before it was a choice
+        given["norm_adv"] = "minibatch" if given["norm_adv"] == "True" else "none"
     script = ppo_trxl if "trxl_dim" in given else ppo_gru
     return {"script": script.__name__} | {name: given.get(name, str(v)) for name, v in asdict(script.Args()).items()}
 

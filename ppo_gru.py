@@ -1042,6 +1042,14 @@ def flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
+def as_flags(values: dict[str, Any]) -> str:
+    """Return values of fields of Args as a command line."""
+    negated = {f"no_{name}" if value is False else name: value for name, value in values.items()}
+    return " ".join(
+        flag(name) if isinstance(value, bool) else f"{flag(name)} {value}" for name, value in negated.items()
+    )
+
+
 def parse_args(argv: list[str]) -> Args:
     """Parse a command line; its flags win over what --preset holds, or what the run of --resume began with.
 
@@ -1054,7 +1062,7 @@ def parse_args(argv: list[str]) -> Args:
     default = Args(**PRESETS.get(given.preset, {}))  # an unknown one is told by tyro, as all errors are
     if given.resume is not None:
         default = saved_args(read_checkpoint(given.resume))
-    laptop = " ".join(f"{flag(name)} {value}" for name, value in PRESETS["laptop"].items())
+    laptop = as_flags(PRESETS["laptop"])
     description = f"{Args.__doc__} The defaults are the thesis'. --preset laptop stands for {laptop}"
     return tyro.cli(Args, args=argv, default=default, description=description)
 
@@ -1536,7 +1544,7 @@ def load_weights(agent: Agent, saved: dict[str, Any], path: str | Path) -> None:
         if not all(name.startswith(("decoder.", "estimator.")) for name in (*missing, *unexpected)):
             raise RuntimeError
     except (RuntimeError, TypeError):
-        theirs = " ".join(f"{flag(name)} {getattr(saved_args(saved), name)}" for name in NETWORK_FLAGS)
+        theirs = as_flags({name: getattr(saved_args(saved), name) for name in NETWORK_FLAGS})
         raise ValueError(f"{path} holds the weights of another network, trained with {theirs}") from None
     if not all(weight.isfinite().all() for weight in saved["weights"].values()):
         raise ValueError(f"{path} holds weights that are not finite: the training diverged")

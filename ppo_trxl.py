@@ -240,7 +240,7 @@ class Args:
     trxl_init: Literal["xavier", "orthogonal", "kaiming", "tfixup"] = "xavier"
     """how the blocks' weights are initialized"""
     trxl_layer_norm: Literal["pre", "post"] = "pre"
-    """where a block normalizes: what goes into attention and projection, or what comes out of their merging"""
+    """where a block normalizes: before attention and projection, or after each is merged with its input"""
     trxl_gate: Literal["none", "gru"] = "none"
     """what merges a layer's output with its input: residual connections (TrXL) or gates (GTrXL)"""
     trxl_gate_bias: bounded(float, "a finite number", math.isfinite) = 0.0
@@ -1316,6 +1316,14 @@ def flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
+def as_flags(values: dict[str, Any]) -> str:
+    """Return values of fields of Args as a command line."""
+    negated = {f"no_{name}" if value is False else name: value for name, value in values.items()}
+    return " ".join(
+        flag(name) if isinstance(value, bool) else f"{flag(name)} {value}" for name, value in negated.items()
+    )
+
+
 def parse_args(argv: list[str]) -> Args:
     """Parse a command line; its flags win over what --preset holds, or what the run of --resume began with.
 
@@ -1328,7 +1336,7 @@ def parse_args(argv: list[str]) -> Args:
     default = Args(**PRESETS.get(given.preset, {}))  # an unknown one is told by tyro, as all errors are
     if given.resume is not None:
         default = saved_args(read_checkpoint(given.resume))
-    laptop = " ".join(f"{flag(name)} {value}" for name, value in PRESETS["laptop"].items())
+    laptop = as_flags(PRESETS["laptop"])
     description = f"{Args.__doc__} The defaults are the thesis'. --preset laptop stands for {laptop}"
     return tyro.cli(Args, args=argv, default=default, description=description)
 
@@ -1810,7 +1818,7 @@ def load_weights(agent: Agent, saved: dict[str, Any], path: str | Path) -> None:
         if not all(name.startswith(("decoder.", "estimator.")) for name in (*missing, *unexpected)):
             raise RuntimeError
     except (RuntimeError, TypeError):
-        theirs = " ".join(f"{flag(name)} {getattr(saved_args(saved), name)}" for name in NETWORK_FLAGS)
+        theirs = as_flags({name: getattr(saved_args(saved), name) for name in NETWORK_FLAGS})
         raise ValueError(f"{path} holds the weights of another network, trained with {theirs}") from None
     if not all(weight.isfinite().all() for weight in saved["weights"].values()):
         raise ValueError(f"{path} holds weights that are not finite: the training diverged")

@@ -20,7 +20,7 @@ def play(rng: np.random.Generator, seeds: int, spread: float, levels: np.ndarray
 
 
 def interval_level_by_level(scores: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the ends (2,) of an interval that draws seeds anew for each level, right only if levels share no seed."""
+    """Return the ends (2,) of an interval that draws other seeds for each level, right only if levels share no seed."""
     drawn = rng.integers(len(scores), size=(RESAMPLES, *scores.shape))
     return np.percentile(iqm(np.take_along_axis(scores[None], drawn, axis=1)), [2.5, 97.5])
 
@@ -40,7 +40,7 @@ def coverage(seeds: int, spread: float) -> list[float]:
 
 def main() -> None:
     """Print the table."""
-    print("| seeds | standard deviation between seeds | seeds drawn whole | drawn anew for each level |")
+    print("| seeds | standard deviation between seeds | seeds drawn whole | drawn for each level |")
     print("|---:|---:|---:|---:|")
     for seeds in (3, 5, 10):
         for spread in (0.0, 0.05, 0.15):

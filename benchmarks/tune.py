@@ -27,8 +27,8 @@ pruner, since it compares a trial's best report so far with the other trials' re
 training is warm-up, for in Mystery Path little is learned before. Half of the trials are kept, where the thesis kept a
 quarter: the pruner compares with completed trials only, and these are the better ones.
 
-The tasks take --steps-scale 0.6 of the steps that benchmarks/learning.py gives them, 0.6 to 0.9 million: wanted is what
-learns them sooner. Learning rate and entropy bonus decay over these steps, so that the end of a training shows what a
+The tasks take --steps-scale 0.6 of the steps that benchmarks/learning.py gives them, 0.6 to 0.9 million: the aim is to
+learn them sooner. Learning rate and entropy bonus decay over these steps, so that the end of a training shows what a
 small learning rate does. As in the thesis (6.1.1), a trial is not repeated with other seeds: the tasks are its
 repetitions. But the best of many noisy scores is partly luck. This trains the preset and the best five of the search
 again with other seeds, for as many steps as benchmarks/learning.py does, and prunes none:
@@ -63,7 +63,7 @@ import tyro
 from learning import TASKS, Task
 
 from evaluate import SCRIPTS
-from ppo_gru import flag
+from ppo_gru import as_flags, flag
 
 try:
     import optuna
@@ -96,7 +96,7 @@ SPACE = {
     "final_lr_fraction": log_range(0.01, 1.0),  # of init_lr
     "init_ent_coef": log_range(1e-5, 3e-2),
     "final_ent_fraction": log_range(0.01, 1.0),  # of init_ent_coef
-    # num_envs x num_steps. Fewer environments make a step dear, larger rollouts leave less than a hundred updates.
+    # num_envs x num_steps. Fewer environments make a step costly, larger rollouts leave few updates.
     "layout": one_of("32x64", "64x64", "32x128", "64x128", "32x256"),
     "num_minibatches": one_of(2, 4, 8, 16),
     "update_epochs": one_of(2, 3, 4),  # table 6.1; a training's time is nearly proportional to it
@@ -236,7 +236,9 @@ def slices(script: ModuleType, args: Any, task: Task) -> Iterator[float]:
         for part in np.array_split(first_steps, SLICES):
             scores = [each for step in part.tolist() for each in iteration(script, args, run, step, task.metric)]
             last = normalized(task, scores) if scores else last
+            generator = torch.get_rng_state()
             yield last
+            torch.set_rng_state(generator)  # the other trainings drew from it meanwhile
     except FloatingPointError:
         while True:
             yield 0.0
@@ -325,10 +327,13 @@ def lock_path(config: Config, number: int) -> Path:
 def open_study(config: Config) -> optuna.Study:
     """Open the search, or begin it with the preset; queue what a killed process had begun.
 
-    Raises ValueError if the folder holds a search whose scores do not compare.
+    Raises ValueError if the folder holds a search whose scores do not compare, or as `first_trials` does.
     """
+    first = first_trials(config)
     (config.folder / "locks").mkdir(parents=True, exist_ok=True)
     pruner = optuna.pruners.PercentilePruner(config.keep, UNPRUNED_TRIALS, WARM_UP - 1)
+    if config.keep == 100:  # that pruner would still prune what is worse than all others
+        pruner = optuna.pruners.NopPruner()
     wanted = {
         "--steps-scale": config.steps_scale,
         "--seeds": config.seeds,
@@ -342,22 +347,26 @@ def open_study(config: Config) -> optuna.Study:
         )
         if not study.user_attrs:
             study.set_user_attr("search", wanted)
-            queue_first_trials(study, config)
+            for name, params in first.items():
+                study.enqueue_trial(params, user_attrs={"name": name})
         found = study.user_attrs["search"]
-        found["search space"] = wanted["search space"] | found["search space"]  # it may have grown
         if differ := [name for name in wanted if found[name] != wanted[name]]:
             raise ValueError(f"{config.folder} holds a search with another {differ[0]}; use another --folder")
         queue_killed_trials(study, config)
     return study
 
 
-def queue_first_trials(study: optuna.Study, config: Config) -> None:
-    """Queue the preset, and the best trials of another search with --again; raise ValueError as `best_trials` does."""
-    study.enqueue_trial(preset_params(config.script), user_attrs={"name": PRESET})
+def first_trials(config: Config) -> dict[str, dict[str, Any]]:
+    """Return the preset's parameters by its name, and with --again those of the best trials of another search.
+
+    Raises ValueError if that search has none.
+    """
+    first = {PRESET: preset_params(config.script)}
     if config.again is not None:
         found = best_trials(load_study(replace(config, folder=config.again)))
-        for trial in [each for each in found if name_of(each) != PRESET][:SHOWN]:
-            study.enqueue_trial(trial.params, user_attrs={"name": f"{name_of(trial)} of {config.again.name}"})
+        others = [trial for trial in found if name_of(trial) != PRESET][:SHOWN]
+        first |= {f"{name_of(trial)} of {config.again.name}": trial.params for trial in others}
+    return first
 
 
 def journal(config: Config) -> Path:
@@ -385,10 +394,12 @@ def work(config: Config, worker: int, until: float) -> None:
     counted = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING)
     os.chdir(config.folder)  # a script makes its run folder in the current one
     try:
-        while time.time() < until and len(study.get_trials(deepcopy=False, states=counted)) < config.trials:
+        while time.time() < until:
             study.sampler = sampler(config, worker, len(study.get_trials(deepcopy=False)))
             with contextlib.ExitStack() as stack:
                 with locked(config.folder / "locks" / config.script):  # nobody sees a trial before it is locked
+                    if len(study.get_trials(deepcopy=False, states=counted)) >= config.trials:
+                        break
                     trial = study.ask(space_of(config.script))
                     stack.enter_context(locked(lock_path(config, trial.number)))
                 finish(study, trial, config)
@@ -397,7 +408,7 @@ def work(config: Config, worker: int, until: float) -> None:
 
 
 def sampler(config: Config, worker: int, trials: int) -> optuna.samplers.BaseSampler:
-    """Return a TPE sampler for the next trial, its seed another one for each: a search that goes on draws anew."""
+    """Return a TPE sampler for the next trial, its seed another one for each, also where a search goes on."""
     seed = int(np.random.SeedSequence([config.sampler_seed, worker, trials]).generate_state(1)[0])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
@@ -473,10 +484,10 @@ def best_trials(study: optuna.Study) -> list[FrozenTrial]:
 def importances(study: optuna.Study, complete: list[FrozenTrial]) -> dict[str, float]:
     """Return how much each parameter matters for being among the best quarter (PED-ANOVA), the largest first.
 
-    The numbers sum to 1. All are 0 where complete trials are few.
+    The numbers sum to 1. There are none where complete trials are few.
     """
     if len(complete) < FEW:
-        return dict.fromkeys(complete[0].params, 0.0)
+        return {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         return get_param_importances(study, evaluator=PedAnovaImportanceEvaluator(target_quantile=0.25))
@@ -496,8 +507,7 @@ def trials_table(trials: list[FrozenTrial], tasks: list[str]) -> str:
         rows[f"{name}: area, low"] = ["{:.2f}, {:.2f}".format(*pair) for pair in pairs]
     rows["minutes"] = [f"{trial.user_attrs['seconds'] / 60:.1f}" for trial in trials]
     found = [settings(trial.params) for trial in trials]
-    # A parameter that came to the space later has an empty cell in earlier trials.
-    rows |= {f"`{flag(name)}`": [f"{each.get(name, '')}" for each in found] for each in found for name in each}
+    rows |= {f"`{flag(name)}`": [f"{each[name]}" for each in found] for name in found[0]}
     lines = [["", *map(name_of, trials)], ["---", *["---:"] * len(trials)]]
     lines += [[name, *cells] for name, cells in rows.items()]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
@@ -505,13 +515,7 @@ def trials_table(trials: list[FrozenTrial], tasks: list[str]) -> str:
 
 def flags_of(params: dict[str, Any]) -> str:
     """Return parameters as flags of the script."""
-    words = []
-    for name, value in settings(params).items():
-        if isinstance(value, bool):
-            words.append(flag(name if value else f"no_{name}"))
-        else:
-            words.append(f"{flag(name)} {value}")
-    return " ".join(["--preset laptop", *words])
+    return f"--preset laptop {as_flags(settings(params))}"
 
 
 def report(config: Config) -> None:
@@ -525,7 +529,7 @@ def report(config: Config) -> None:
     print(f"\n{config.script}, trials: {told}\n\n{trials_table(shown, tasks)}\n")
     print(f"The best one: `{flags_of(complete[0].params)}`\n")
     found = importances(study, complete)
-    if len(complete) < FEW:
+    if not found:
         print(f"Importances are told from {FEW} complete trials on.")
     else:
         print("| parameter | importance |\n|---|---:|")
@@ -535,8 +539,8 @@ def report(config: Config) -> None:
 
 def draw(study: optuna.Study, names: list[str], out: Path) -> None:
     """Draw the scores in the order of the trials, and against these parameters, to OUT.png."""
-    figure = Figure(figsize=(15, 4), layout="constrained")
-    order, *others = figure.subplots(1, 1 + len(names), width_ratios=[1.6, *[1] * len(names)])
+    figure = Figure(figsize=(6 + 3 * len(names), 4), layout="constrained")
+    order, *others = figure.subplots(1, 1 + len(names), width_ratios=[1.6, *[1] * len(names)], squeeze=False)[0]
     complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     pruned = study.get_trials(deepcopy=False, states=(TrialState.PRUNED,))
     dot, best, cross, line = color_sequences["petroff10"][:4]
@@ -557,8 +561,7 @@ def draw(study: optuna.Study, names: list[str], out: Path) -> None:
 
 
 def draw_parameter(axis: Axes, name: str, complete: list[FrozenTrial]) -> None:
-    """Draw the scores of complete trials that have a parameter against it, later trials darker."""
-    complete = [trial for trial in complete if name in trial.params]
+    """Draw the scores of complete trials against a parameter, later trials darker."""
     kind = complete[0].distributions[name]
     values = [trial.params[name] for trial in complete]
     if isinstance(kind, CategoricalDistribution):

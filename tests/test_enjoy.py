@@ -102,13 +102,20 @@ def test_every_kind_of_agent(name, saved):
 
 
 @pytest.mark.parametrize("flags", [{}, {"trxl_query_output": True, "trxl_query_position": True}], ids=str)
-def test_the_episode_is_the_agents(flags, saved):
+def test_the_episode_is_the_agents(flags, saved, monkeypatch):
     """Played again with the agent's own `act`: the same pictures, numbers and attention, step for step."""
     saved(ppo_trxl, env_id="MortarMayhem-Grid-v0", **flags)
     agent, envs, _ = enjoy.load("model.pt")
     episode = enjoy.play(agent, envs, 3, None, 60)
     page = enjoy.page_data(episode, "MortarMayhem-Grid-v0", {})
     view, truth = map(frames_of, page["videos"])
+    used, forward = [], ppo_trxl.Attention.forward
+
+    def noted(attention, x, keys, values, age, seen):
+        used.append(enjoy.attention_weights(attention, x, keys, age, seen)[0, :, 0])
+        return forward(attention, x, keys, values, age, seen)
+
+    monkeypatch.setattr(ppo_trxl.Attention, "forward", noted)
     torch.manual_seed(3)
     obs, infos = envs.reset(seed=3)
     memory, cpu = agent.memory.initial_state(1, 60, torch.device("cpu")), torch.device("cpu")
@@ -118,11 +125,11 @@ def test_the_episode_is_the_agents(flags, saved):
         assert np.array_equal(truth[t], envs.render()[0])
         assert np.array_equal(episode.truth[t], infos["ground_truth"][0])
         with torch.no_grad():
-            looks = enjoy.attention_of(agent.memory, agent.encoder(ppo_gru.as_tensors(obs, cpu)), memory)[0]
+            used.clear()
             taken, log_probs, value, memory = agent.act(ppo_gru.as_tensors(obs, cpu), memory)
         assert episode.values[t] == value.item()
         assert episode.policy[t][0][actions[0]] == pytest.approx(log_probs.exp().item())
-        assert np.array_equal(episode.attention[t], looks.numpy())
+        assert np.array_equal(episode.attention[t], torch.stack(used).numpy())
         assert taken.tolist() == [actions]
         obs, rewards, terminated, truncated, infos = envs.step(taken.numpy())
         assert episode.rewards[t] == rewards[0]

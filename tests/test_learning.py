@@ -1,13 +1,10 @@
 """benchmarks/learning.py: its command lines, and which runs it need not train again."""
 
 import signal
-import sys
 from pathlib import Path
 
-import pytest
-
-sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
 import learning
+import pytest
 
 import ppo_gru
 

@@ -377,7 +377,6 @@ def test_acting_and_learning_ask_no_device_for_numbers(played, monkeypatch, memo
 def test_refreshing_with_the_weights_that_acted_changes_nothing(played, env_id, memory):
     args, run, *_ = played(iterations=3, env_id=env_id, **memory)
     before = [part.clone() if isinstance(part, torch.Tensor) else part for part in run.rollout.memory_state]
-    run.rollout.memory_state = run.rollout.memory_state._replace()
     memory.get("script", ppo_gru).refresh_memory(run.agent, run.rollout, args)
     for name, was, now in zip(run.rollout.memory_state._fields, before, run.rollout.memory_state, strict=True):
         assert torch.equal(was, now) if isinstance(was, torch.Tensor) else was == now, name

@@ -22,7 +22,7 @@ GRID = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector"}
 ENDLESS = {"env_id": "Endless-SearingSpotlights-v0", "obs_type": "vector"}
 RUNS = {
     "GRU, pixels": {"env_id": "MortarMayhemB-Grid-v0"},
-    "GRU, endless": {**ENDLESS, "seq_len": 5, "num_layers": 2},
+    "GRU, endless": {**ENDLESS, "seq_len": 5, "num_layers": 2, "refresh_memory": True},
     "LSTM": {**GRID, "memory": "lstm"},
     "LSTM, endless pixels, reconstruction": {
         "env_id": "Endless-MortarMayhem-v0", "memory": "lstm", "reconstruction_coef": 0.1
@@ -40,7 +40,10 @@ RUNS = {
     "TrXL, learned": {
         "script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "learned", "trxl_query_position": True
     },
-    "TrXL, relative": {"script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "relative", "trxl_segment_length": 5},
+    "TrXL, relative": {
+        "script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "relative", "trxl_segment_length": 5,
+        "trxl_memory_gradient": True, "refresh_memory": True,
+    },
     "TrXL, output in the query": {
         "script": ppo_trxl, **ENDLESS, "trxl_query_output": True, "trxl_layer_norm": "post"
     },
@@ -51,7 +54,8 @@ RUNS = {
         "eval_repeats": 2, "eval_max_steps": 30,
     },
     "TrXL, both heads": {
-        "script": ppo_trxl, "env_id": "SearingSpotlights-v0", "ground_truth_coef": 0.1, "reconstruction_coef": 0.1
+        "script": ppo_trxl, "env_id": "SearingSpotlights-v0", "ground_truth_coef": 0.1, "reconstruction_coef": 0.1,
+        "reconstruction_detach": True,
     },
 }  # fmt: skip
 

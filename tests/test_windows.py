@@ -53,7 +53,9 @@ def naive(memory, x, row, lane, stored, own=None):
     step = int(stored.item_steps[row, lane])
     window = min(step, memory.window)
     at = torch.arange(row - window, row)
-    told = memory.in_query(stored.item_steps[row, lane], torch.zeros_like(stored.items[row, lane]), x.dtype)
+    told = torch.zeros_like(x)
+    if memory.query_position:
+        told = told + (memory.table[step] if memory.encoding == "learned" else sinusoid(torch.tensor(step), WIDTH))
     if memory.query_output is not None and step > 0:
         told = told + memory.query_output.weight @ stored.items[row - 1, lane, -1]
     inputs = []
@@ -153,10 +155,9 @@ def test_the_gradient_through_a_segment_equals_a_loop_s(changes):
 
 @pytest.mark.parametrize("gate", ["none", "gru"])
 def test_how_far_the_gradient_reaches(gate):
-    """To the segment's first step, within the window of each block and the episode; not into what is stored."""
+    """To the segment's first step, within the window of each block and the episode."""
     memory = make_memory(trxl_memory_gradient=True, trxl_gate=gate, trxl_memory_length=3)
     stored = make_timeline(memory)
-    stored = stored._replace(items=stored.items.requires_grad_())
     stored.item_steps[:] = torch.arange(100, 100 + len(stored.item_steps))[:, None]  # an episode that goes on
     stored.item_steps[memory.window + 12 :, 1] -= 100 + memory.window + 12  # in environment 1 another begins at step 12
     pieces = memory.cut(torch.zeros(STEPS, LANES, dtype=torch.bool))
