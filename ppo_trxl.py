@@ -1318,9 +1318,9 @@ def flag(name: str) -> str:
 
 def as_flags(values: dict[str, Any]) -> str:
     """Return values of fields of Args as a command line."""
-    negated = {f"no_{name}" if value is False else name: value for name, value in values.items()}
     return " ".join(
-        flag(name) if isinstance(value, bool) else f"{flag(name)} {value}" for name, value in negated.items()
+        flag(name if value else f"no_{name}") if isinstance(value, bool) else f"{flag(name)} {value}"
+        for name, value in values.items()
     )
 
 
