@@ -183,7 +183,7 @@ class Args:
     max_grad_norm: PositiveFloat = 0.25
     """the gradient is scaled down to this norm"""
     target_kl: PositiveFloat | None = None
-    """end an iteration's update after the epoch whose mean KL divergence exceeds this"""
+    """end an iteration's update at the first minibatch whose KL divergence from the policy that acted exceeds this"""
     init_lr: UnitInterval = 2.75e-4
     """learning rate at the first step"""
     final_lr: UnitInterval = 1.0e-5
@@ -260,6 +260,7 @@ PRESETS = {
         "gamma": 0.99,
         "clip_coef": 0.2,
         "max_grad_norm": 0.5,
+        "target_kl": 0.05,
         "init_lr": 1e-3,
         "final_lr": 1e-4,
         "init_ent_coef": 0.001,
@@ -1160,32 +1161,37 @@ def update(
     apart = {parameter for probe in probes for parameter in probe}
     parameters = [parameter for parameter in agent.parameters() if parameter not in apart]
     logs = []
-    for epoch in range(args.update_epochs):
-        if args.refresh_memory and epoch > 0:
-            refresh_memory(agent, rollout, args)
-        for minibatch in pieces.minibatches(args.num_minibatches):
-            loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
-            optimizer.zero_grad()
-            loss.backward()
-            average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
-            log["grad_norm"] = nn.utils.clip_grad_norm_(parameters, args.max_grad_norm)
-            probe_norms = sum(nn.utils.clip_grad_norm_(probe, args.max_grad_norm) for probe in probes)
-            if not (log["loss"] + log["grad_norm"] + probe_norms).isfinite():
-                raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
-            optimizer.step()
-            logs.append(log)
-        if args.target_kl is not None:
-            kl = mean_log(logs[-args.num_minibatches :])["approx_kl"]
-            if np.mean(all_gather(kl)) > args.target_kl:  # section 8: so that all stop at the same epoch
+    for minibatch in epochs(agent, rollout, pieces, args):
+        loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
+        if args.target_kl is not None and logs:  # before the first step, the policy is still the one that acted
+            kl = np.mean(all_gather(log["approx_kl"].item()))  # section 8: over processes, which so stop together
+            if kl > args.target_kl:
                 break
+        optimizer.zero_grad()
+        loss.backward()
+        average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
+        log["grad_norm"] = nn.utils.clip_grad_norm_(parameters, args.max_grad_norm)
+        probe_norms = sum(nn.utils.clip_grad_norm_(probe, args.max_grad_norm) for probe in probes)
+        if not (log["loss"] + log["grad_norm"] + probe_norms).isfinite():
+            raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
+        optimizer.step()
+        logs.append(log)
 
     losses = mean_log(logs)
     # Before the first gradient step the weights are those that acted, and so must be every probability.
     losses["ratio_error"] = logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
     padding = 1 - float(pieces.length.float().mean() / pieces.length.max())  # if all were padded to the longest
-    charts = {"padding_fraction": padding, **agent.memory.logs(rollout.memory_state)}
+    charts = {"gradient_steps": len(logs), "padding_fraction": padding, **agent.memory.logs(rollout.memory_state)}
     return {f"losses/{k}": v for k, v in losses.items()} | {f"charts/{k}": v for k, v in charts.items()}
+
+
+def epochs(agent: Agent, rollout: Rollout, pieces: Pieces, args: Args) -> Iterator[Pieces]:
+    """Yield the minibatches of all epochs; before each epoch but the first, refresh the memory if that is wanted."""
+    for epoch in range(args.update_epochs):
+        if args.refresh_memory and epoch > 0:
+            refresh_memory(agent, rollout, args)
+        yield from pieces.minibatches(args.num_minibatches)
 
 
 def mean_log(logs: list[dict[str, Tensor]]) -> dict[str, float]:

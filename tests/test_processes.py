@@ -100,7 +100,7 @@ def test_gradients_are_means_over_steps(monkeypatch, tiny):
 
 def test_a_resumed_run_is_the_unstopped_one(curves):
     script = ppo_trxl
-    extra = {"eval-interval": 2, "eval-levels": 2, "eval-repeats": 1, "target-kl": 0.01, "checkpoint-interval": 3}
+    extra = {"eval-interval": 2, "eval-levels": 2, "eval-repeats": 1, "target-kl": 5e-6, "checkpoint-interval": 3}
     flags = flags_of(script, **extra)
     subprocess.run(torchrun(script.__file__, *flags, "--exp-name", "whole"), check=True, timeout=300)
     half = [*flags, "--total-timesteps", "192", "--exp-name", "half"]
@@ -112,6 +112,7 @@ def test_a_resumed_run_is_the_unstopped_one(curves):
     subprocess.run(torchrun(script.__file__, *more), check=True, timeout=300)
     before, after = curves(whole), curves(half)
     assert {step for step, _ in before["losses/loss"]} == {64, 128, 192, 256, 320, 384}
+    assert 6 * 1 < sum(steps for _, steps in before["charts/gradient_steps"]) < 6 * 2 * 3, "target-kl ended some"
     for name in ("eval/return", "eval_levels/return"):  # where the shorter run ended it was evaluated too
         after[name] = [(step, value) for step, value in after[name] if step != 192]
     assert {name: points for name, points in after.items() if "eval" not in name} == {

@@ -232,14 +232,27 @@ def test_annealing(tiny, scalars):
     assert still["charts/learning_rate"] == pytest.approx([1e-3, 1e-3])
 
 
-def test_target_kl_ends_the_epochs(played, monkeypatch):
-    args, run, *_ = played(env_id="CueRecall-v0", update_epochs=5, target_kl=1e-9)
+@pytest.mark.parametrize("target_kl", [None, 1e-9, 3e-5, 1e9])
+def test_target_kl_ends_the_update_at_the_first_minibatch_beyond_it(played, monkeypatch, target_kl):
+    args, run, *_ = played(env_id="CueRecall-v0", update_epochs=5, target_kl=target_kl)
     run.rollout.advantages.normal_()
-    steps = []
-    optimizer = torch.optim.SGD(run.agent.parameters(), lr=1.0)
+    divergences, loss_of, steps = [], ppo_gru.ppo_loss, []
+
+    def recorded(*given):
+        loss, log = loss_of(*given)
+        divergences.append(log["approx_kl"].item())
+        return loss, log
+
+    monkeypatch.setattr(ppo_gru, "ppo_loss", recorded)
+    optimizer = torch.optim.SGD(run.agent.parameters(), lr=0.1)
     monkeypatch.setattr(optimizer, "step", lambda step=optimizer.step: (steps.append(1), step()))
-    ppo_gru.update(run.agent, optimizer, run.rollout, 0.0, args)
-    assert len(steps) == args.num_minibatches
+    logs = ppo_gru.update(run.agent, optimizer, run.rollout, 0.0, args)
+    if target_kl in (None, 1e9):
+        assert len(steps) == len(divergences) == 5 * args.num_minibatches
+    else:
+        assert len(steps) == len(divergences) - 1 < 5 * args.num_minibatches
+        assert divergences[-1] > target_kl >= max(divergences[:-1])
+    assert logs["charts/gradient_steps"] == len(steps) > 0
 
 
 def test_logged_divergences(played):
