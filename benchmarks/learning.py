@@ -110,7 +110,7 @@ TASKS = {
 class Config:
     """What to train and to draw."""
 
-    tasks: tuple[str, ...] = ("mortar-mayhem", "mystery-path")
+    tasks: tuple[str, ...] = tuple(TASKS)
     """of those that this program knows"""
     agents: tuple[str, ...] = ("no memory", "stack of 4", "GRU", "TrXL")
     """of those that this program knows, each alone or with further flags, e.g. "TrXL --trxl-num-layers 3" """

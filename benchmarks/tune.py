@@ -102,6 +102,7 @@ SPACE = {
     "update_epochs": one_of(2, 3, 4),  # table 6.1; a training's time is nearly proportional to it
     "clip_coef": one_of(0.1, 0.2, 0.3),  # table 6.1
     "max_grad_norm": one_of(0.25, 0.35, 0.5, 1.0),  # table 6.1
+    "target_kl": one_of(None, 0.02, 0.05, 0.1),
     "gamma": one_of(0.98, 0.99, 0.995, 0.998),  # looks ahead 50, 100, 200, 500 steps: the tasks' episodes are as long
     "gae_lambda": one_of(0.9, 0.95, 0.98),
     "vf_coef": one_of(0.25, 0.5, 1.0),
