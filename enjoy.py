@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 import ppo_gru
 import ppo_trxl
+from evaluate import script_of
 from memory_gym_envs.making import final_numbers, is_memory_gym, parse_options
 
 try:
@@ -277,7 +278,7 @@ def load(path: str) -> tuple[nn.Module, gym.vector.VectorEnv, Any]:
     Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
     """
     saved = ppo_gru.read_model(path)
-    script = ppo_trxl if saved["script"] == "ppo_trxl" else ppo_gru
+    script = script_of(saved, path)
     args = replace(script.saved_args(saved), amp=False)  # one lane is little work; not every processor has bfloat16
     envs = script.environments(args, 1, render_mode="debug_rgb_array")
     _, infos = envs.reset(options=parse_options(args.env_id, args.env_options))

@@ -244,8 +244,9 @@ def hyperparameters(events: EventAccumulator) -> dict[str, str]:
     given = dict(row[1:-1].split("|", 1) for row in rows)
     if given.get("norm_adv") in ("True", "False"):  # before it was a choice
         given["norm_adv"] = "minibatch" if given["norm_adv"] == "True" else "none"
-    script = ppo_trxl if "trxl_dim" in given else ppo_gru
-    return {"script": script.__name__} | {name: given.get(name, str(v)) for name, v in asdict(script.Args()).items()}
+    name = given.pop("script", "ppo_trxl" if "trxl_dim" in given else "ppo_gru")  # an older run does not say it
+    defaults = asdict(SCRIPTS[name].Args()) if name in SCRIPTS else given
+    return {"script": name} | {key: given.get(key, str(value)) for key, value in defaults.items()}
 
 
 def curve_name(metric: str, runs: list[EventAccumulator]) -> str:
@@ -425,6 +426,13 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
 
 
 # ---- SCORES ----
+def script_of(saved: dict[str, Any], path: str) -> ModuleType:
+    """Return the script that wrote the checkpoint in a file; raise ValueError if it is not among `SCRIPTS`."""
+    if saved["script"] not in SCRIPTS:
+        raise ValueError(f"{path} was trained by {saved['script']}.py, which is not among SCRIPTS in evaluate.py")
+    return SCRIPTS[saved["script"]]
+
+
 @dataclass
 class Checkpoint:
     """What a model file holds, read once."""
@@ -439,9 +447,7 @@ class Checkpoint:
     def read(cls, path: str, config: Config) -> "Checkpoint":
         """Read a file; raise ValueError if it is no checkpoint, OSError if it cannot be read."""
         saved = ppo_gru.read_model(path)
-        if saved["script"] not in SCRIPTS:
-            raise ValueError(f"{path} was trained by {saved['script']}.py, which evaluate.py does not know")
-        script = SCRIPTS[saved["script"]]
+        script = script_of(saved, path)
         settings = {"eval_levels": config.levels, "eval_repeats": config.repeats, "eval_max_steps": config.max_steps}
         args = replace(script.saved_args(saved), cuda=config.cuda, **settings)
         # A file to resume from holds much more, which would stay in memory.

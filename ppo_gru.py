@@ -1233,7 +1233,8 @@ def make_folder(args: Args, run: Run) -> None:
 def open_logs(args: Args, run: Run) -> None:
     """Open the TensorBoard file, which hides what was logged beyond the run's step, and the progress bar."""
     run.writer = SummaryWriter(str(run.folder), purge_step=run.step + 1 if run.step else None)
-    rows = "\n".join(f"|{key}|{' '.join(str(value).split())}|" for key, value in asdict(args).items())
+    told = {"script": Path(__file__).stem, **asdict(args)}
+    rows = "\n".join(f"|{key}|{' '.join(str(value).split())}|" for key, value in told.items())
     run.writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}", run.step)
     batch_size = args.num_envs * args.num_steps
     total = args.total_timesteps // batch_size * batch_size

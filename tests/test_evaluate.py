@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
+import enjoy
 import evaluate
 import memory_gym_envs
 import ppo_gru
@@ -260,6 +261,20 @@ def test_the_arguments_of_an_older_run():
     changed = {"script": "ppo_gru", "seed": "3", "num_envs": "4", "env_id": "A-v0", "norm_adv": "minibatch"}
     assert evaluate.hyperparameters(run) == defaults | changed
     assert [each.tolist() for each in evaluate.read_curve(run, "eval/return")] == [[10], [[2]]]
+
+
+def test_the_arguments_of_a_run_of_another_script():
+    with SummaryWriter("other") as writer:
+        writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|script|ppo_other|\n|seed|3|")
+        writer.add_scalar("eval/return", 2.0, 10)
+    assert evaluate.hyperparameters(evaluate.read_run("other")) == {"script": "ppo_other", "seed": "3"}
+
+
+def test_a_model_of_another_script():
+    torch.save({"script": "ppo_other", "args": {}, "weights": {}}, "model.pt")
+    for read in (lambda: evaluate.Checkpoint.read("model.pt", evaluate.Config()), lambda: enjoy.load("model.pt")):
+        with pytest.raises(ValueError, match=r"model\.pt was trained by ppo_other\.py, which is not among SCRIPTS"):
+            read()
 
 
 # ---- curves over time ----
