@@ -400,7 +400,8 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
     args = {path: hyperparameters(run) for path, run in events.items()}
     tasks = tasks_of(args, task_of)
     columns = len(config.metrics) or 1
-    figure = Figure(figsize=(5.5 * columns, 4 * len(tasks)), layout="constrained")
+    legend = 0.22 * max(map(len, tasks.values()))  # inches below the curves
+    figure = Figure(figsize=(5.5 * columns, (3.8 + legend) * len(tasks)), layout="constrained")
     report = []
     for axes, (title, agents) in zip(figure.subplots(len(tasks), columns, squeeze=False), tasks.items(), strict=True):
         runs = {label: [events[path] for path in paths] for label, paths in agents.items()}
@@ -420,6 +421,7 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
         print(f"{title}, where the curves end\n\n{table(summaries)}\n")
         if any("wall_time" in each for each in summaries):
             print(f"{title}, seconds of an iteration and hours of a training\n\n{time_table(summaries)}\n")
+    figure.draw_without_rendering()  # the layout changes the ticks, and these the layout
     for name in (f"{config.out}.png", f"{config.out}.svg"):
         figure.savefig(name, dpi=150)
     return report
