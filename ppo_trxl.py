@@ -1164,7 +1164,7 @@ def update(
     for minibatch in epochs(agent, rollout, pieces, args):
         loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
         if args.target_kl is not None and logs:  # before the first step, the policy is still the one that acted
-            kl = np.mean(all_gather(log["approx_kl"].item()))  # section 8: over processes, which so stop together
+            kl = np.mean(all_gather(log["approx_kl"].item()))  # section 8: over processes, so that all stop at once
             if kl > args.target_kl:
                 break
         optimizer.zero_grad()
