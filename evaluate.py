@@ -7,12 +7,14 @@
 
 Runs whose arguments differ in nothing but the seed are the seeds of one agent. Files of one run, written at different
 steps of the training, are agents of their own. As in the thesis (6.1.2, 6.1.3), every seed plays 50 levels outside its
-training set, three times each. An agent's score is the interquartile mean (IQM): the mean of the middle half of what
-its seeds scored on the levels. The 95 % interval is a stratified bootstrap's over the seeds: how far the IQM would move
-with other seeds. A single seed cannot tell, and has none.
+training set, three times each. An agent's score is the interquartile mean (IQM): the mean of the middle half of all
+episodes of its seeds, as the thesis pools 750 of them. Beside it stands the IQM of the levels' means, which is another
+number: where 70 % of the episodes succeed, the middle half has hardly a failure, but many a level has a mean below 1.
+The 95 % interval is a stratified bootstrap's over the seeds: how far the IQM would move with other seeds. A single seed
+cannot tell, and has none.
 
-Shape letters: R seeds (training runs) of an agent, M levels, I iterations of a run, P points of a curve,
-B bootstrap resamples.
+Shape letters: R seeds (training runs) of an agent, M levels, E episodes on each, I iterations of a run, P points of a
+curve, B bootstrap resamples.
 """
 
 import itertools
@@ -94,7 +96,7 @@ class Config:
     cuda: bool = True
     """play on the GPU when there is one"""
     json: str | None = None
-    """write the scores to this file too, down to each seed's mean on each level"""
+    """write the scores to this file too, down to each episode's"""
 
     curves: tuple[str, ...] = ()
     """run folders whose curves to draw, instead of playing"""
@@ -108,50 +110,55 @@ class Config:
 
 # ---- STATISTICS ----
 def iqm(scores: np.ndarray) -> np.ndarray:
-    """Return the interquartile mean (...) of scores (..., R, M): the mean without the lowest and the highest quarter.
+    """Return the interquartile mean (...) of scores (..., R, M, E): without the lowest and the highest quarter.
 
     As many are left out as fit whole into a quarter: with three scores none, with five the lowest and the highest.
     """
-    return trim_mean(scores.reshape(*scores.shape[:-2], -1), 0.25, axis=-1)
+    return trim_mean(scores.reshape(*scores.shape[:-3], -1), 0.25, axis=-1)
 
 
 def interval(scores: np.ndarray) -> np.ndarray | None:
-    """Return the ends (2, ...) of the IQM's 95 % bootstrap interval for scores (..., R, M); None for a single seed.
+    """Return the ends (2, ...) of the IQM's 95 % bootstrap interval for scores (..., R, M, E); None for a single seed.
 
-    Levels are the strata: a resample has R scores of each. A drawn seed brings its scores on all levels along, for they
+    Levels are the strata: a resample has R seeds on each. A drawn seed brings its scores on all levels along, for they
     come from the same weights. To draw other seeds for each level is right where each has been trained on by itself;
     here it makes the interval far too narrow wherever seeds differ, as benchmarks/interval_coverage.py shows.
     """
-    seeds = scores.shape[-2]
+    seeds = scores.shape[-3]
     if seeds < 2:
         return None
     drawn = np.random.default_rng(0).integers(seeds, size=(RESAMPLES, seeds))  # (B, R)
-    return np.percentile(iqm(scores[..., drawn, :]), [2.5, 97.5], axis=-1)  # of (..., B, R, M)
+    return np.percentile(iqm(scores[..., drawn, :, :]), [2.5, 97.5], axis=-1)  # of (..., B, R, M, E)
 
 
 def summary(agent: str, paths: list[str], scores: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Return what to report of an agent, for JSON: scores (R, M) by metric, paths in the order of the seeds."""
+    """Return what to report of an agent, for JSON: scores (R, M, E) by metric, paths in the order of the seeds."""
     metrics = {}
     for name, values in scores.items():
-        ends = interval(values)
-        metrics[name] = {
-            "mean": float(values.mean()),
-            "iqm": float(iqm(values)),
-            "interval": None if ends is None else ends.tolist(),
-            "scores": values.tolist(),
-        }
+        metrics[name] = {"mean": float(values.mean())}
+        for suffix, each in (("", values), ("_of_levels", values.mean(-1, keepdims=True))):
+            ends = interval(each)
+            metrics[name][f"iqm{suffix}"] = float(iqm(each))
+            metrics[name][f"interval{suffix}"] = None if ends is None else ends.tolist()
+        metrics[name]["scores"] = values.tolist()
     return {"agent": agent, "runs": paths, "metrics": metrics}
 
 
 def table(agents: list[dict[str, Any]]) -> str:
     """Return the summaries as a Markdown table, the agents below each other for every metric."""
-    lines = ["| metric | agent | seeds | mean | IQM | 95 % interval |", "|---|---|---:|---:|---:|---|"]
+    lines = [
+        "| metric | agent | seeds | mean | IQM | 95 % interval | IQM of level means | 95 % interval |",
+        "|---|---|---:|---:|---:|---|---:|---|",
+    ]
     for metric in agents[0]["metrics"]:
         for agent in agents:
             score = agent["metrics"][metric]
-            ends = "none: one seed" if score["interval"] is None else "{:.3f} to {:.3f}".format(*score["interval"])
-            cells = (metric, agent["agent"], len(agent["runs"]), f"{score['mean']:.3f}", f"{score['iqm']:.3f}", ends)
-            lines.append("| {} | {} | {} | {} | {} | {} |".format(*cells))
+            cells = [metric, agent["agent"], len(agent["runs"]), f"{score['mean']:.3f}"]
+            for suffix in ("", "_of_levels"):
+                ends = score[f"interval{suffix}"]
+                cells += [f"{score[f'iqm{suffix}']:.3f}"]
+                cells += ["none: one seed" if ends is None else "{:.3f} to {:.3f}".format(*ends)]
+            lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
 
 
@@ -263,9 +270,10 @@ def curve_name(metric: str, runs: list[EventAccumulator]) -> str:
 
 
 def read_curve(run: EventAccumulator, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the steps (P,) and values (P, M) of a curve: of each level where the evaluations kept them, else M = 1.
+    """Return the steps (P,) and values (P, M, E) of a curve: of every episode where the evaluations kept them.
 
-    Raises ValueError if a scalar is nowhere a number; where it is none, there is no point.
+    Earlier versions kept the levels' means (E = 1), and training episodes are averaged (M = E = 1). Raises ValueError
+    if a scalar is nowhere a number; where it is none, there is no point.
     """
     levels = name.replace("eval/", "eval_levels/")
     if levels != name and levels in run.Tags()["tensors"]:
@@ -276,7 +284,8 @@ def read_curve(run: EventAccumulator, name: str) -> tuple[np.ndarray, np.ndarray
     if not points:
         raise ValueError(f"{run.path} has no number in its curve of {name}")
     steps, values = zip(*points, strict=True)
-    return np.array(steps), np.array(values)
+    values = np.array(values)  # (P, M, E) or (P, M)
+    return np.array(steps), values if values.ndim == 3 else values[..., None]
 
 
 def read_seconds(run: EventAccumulator, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -300,30 +309,31 @@ def training_hours(run: EventAccumulator, steps: np.ndarray) -> np.ndarray:
 
 
 def align(runs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Bring curves, x (P,) and values (P, M) of each run, to a common x (P,): return it and scores (P, R, M).
+    """Bring curves, x (P,) and values (P, M, E) of each run, to a common x (P,): return it and scores (P, R, M, E).
 
     x is steps or hours. The common x is that of all runs, as far as every run reaches; between its own, a run's values
     are interpolated. More than POINTS become so many by the mean of neighbours. Where runs have played different
-    numbers of levels, each run's mean is what compares, and M is 1. Raises ValueError if the runs do not overlap.
+    numbers of episodes, each run's mean is what compares, and M and E are 1. Raises ValueError if the runs do not
+    overlap.
     """
-    if len({values.shape[1] for _, values in runs}) > 1:
-        runs = [(x, values.mean(1, keepdims=True)) for x, values in runs]
+    if len({values.shape[1:] for _, values in runs}) > 1:
+        runs = [(x, values.mean((1, 2), keepdims=True)) for x, values in runs]
     first, last = max(x[0] for x, _ in runs), min(x[-1] for x, _ in runs)
     if first > last:
         raise ValueError("the curves of an agent's seeds do not overlap; leave out the shortest run")
     common = np.unique(np.concatenate([x for x, _ in runs]))
     common = common[(first <= common) & (common <= last)]
-    curves = [[np.interp(common, x, level) for level in values.T] for x, values in runs]  # R x M x (all x,)
-    values = np.moveaxis(np.array(curves), -1, 0)  # (all x, R, M)
+    curves = [np.apply_along_axis(lambda y, x=x: np.interp(common, x, y), 0, values) for x, values in runs]
+    values = np.stack(curves, axis=1)  # (all x, R, M, E)
     parts = np.array_split(np.arange(len(common)), min(len(common), POINTS))
-    scores = np.stack([values[part].mean(0) for part in parts])  # (P, R, M)
+    scores = np.stack([values[part].mean(0) for part in parts])  # (P, R, M, E)
     return np.array([common[part].mean() for part in parts]), scores
 
 
 def draw_metric(
     axis: Axes, name: str, agents: dict[str, list[EventAccumulator]], over: str = "steps"
 ) -> dict[str, np.ndarray]:
-    """Draw a curve of every agent, its runs by label, over steps or time; return each one's last scores (R, M)."""
+    """Draw a curve of every agent, its runs by label, over steps or time; return each one's last scores (R, M, E)."""
     last = {}
     for (label, runs), color in zip(agents.items(), itertools.cycle(color_sequences["petroff10"]), strict=False):
         curves = [read_curve(run, name) for run in runs]
@@ -360,7 +370,7 @@ def wall_time(runs: list[EventAccumulator]) -> dict[str, float]:
         "std": seconds.std(),
         "min": seconds.min(),
         "median": np.median(seconds),
-        "iqm": iqm(seconds[None]),
+        "iqm": trim_mean(seconds, 0.25),
         "max": seconds.max(),
         **parts,
         "hours": np.mean([each.sum() for each in durations]) / 3600,
@@ -463,7 +473,7 @@ class Checkpoint:
 
 
 def play(checkpoint: Checkpoint, seed: int) -> dict[str, np.ndarray]:
-    """Let a checkpoint's agent play the levels; return numbers (M,) by name, each level's mean over its repeats.
+    """Let a checkpoint's agent play the levels; return numbers (M, E) by name.
 
     Raises what the script raises for an environment that is not there or weights that do not fit.
     """
@@ -476,7 +486,7 @@ def play(checkpoint: Checkpoint, seed: int) -> dict[str, np.ndarray]:
     torch.manual_seed(seed)
     found = script.evaluate(agent, envs, args)
     envs.close()
-    return {name: numbers.reshape(args.eval_levels, args.eval_repeats).mean(1) for name, numbers in found.items()}
+    return {name: numbers.reshape(args.eval_levels, args.eval_repeats) for name, numbers in found.items()}
 
 
 def title_of(args: dict[str, Any]) -> str:
@@ -510,7 +520,7 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
         metrics = choose_metrics(config.metrics, arguments[paths[0]]["env_id"], [played[path] for path in paths])
         summaries = []
         for label, members in agents.items():
-            scores = {name: np.stack([played[path][name] for path in members]) for name in metrics}  # (R, M) each
+            scores = {name: np.stack([played[path][name] for path in members]) for name in metrics}  # (R, M, E) each
             summaries.append(summary(label, members, scores))
         finished = float(np.mean([played[path]["finished"] for path in paths]))
         report.append({"task": title, "finished": finished, "agents": summaries})

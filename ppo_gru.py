@@ -1002,7 +1002,7 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
 
 
 def level_scores(args: Args, run: "Run") -> dict[str, Tensor]:
-    """Return an evaluation's metrics by name, each level's mean over its repeats, (--eval-levels,) float64.
+    """Return an evaluation's metrics by name, (--eval-levels, --eval-repeats) float64: every episode on every level.
 
     Training goes on as if there had been none. What only an episode's end tells is left out if an episode was cut
     short: the best ones would be missing. An episode that is too long for the memory ends the evaluation with a warning
@@ -1017,7 +1017,7 @@ def level_scores(args: Args, run: "Run") -> dict[str, Tensor]:
             tqdm.write(f"no evaluation: {error}", file=sys.stderr)
             return {}
     complete = {name: torch.from_numpy(values) for name, values in found.items() if not np.isnan(values).any()}
-    return {name: values.unflatten(0, (-1, args.eval_repeats)).mean(1) for name, values in complete.items()}
+    return {name: values.unflatten(0, (-1, args.eval_repeats)) for name, values in complete.items()}
 
 
 # ---- 8 RUNNING ----

@@ -3,7 +3,8 @@
     python benchmarks/interval_coverage.py
 
 Seeds of an agent succeed on 50 levels with a probability that depends on the seed and on the level; each level is
-played three times. The true score is the IQM of a great many seeds on the same levels. Prints a Markdown table.
+played three times. The true score is the IQM over the episodes of a great many seeds on the same levels. Prints a
+Markdown table.
 """
 
 import numpy as np
@@ -14,14 +15,14 @@ LEVELS, REPEATS, EXPERIMENTS = 50, 3, 400
 
 
 def play(rng: np.random.Generator, seeds: int, spread: float, levels: np.ndarray) -> np.ndarray:
-    """Return the success rates (R, M) of fresh seeds, whose skill has the standard deviation spread."""
-    chance = 0.6 + levels + rng.normal(0, spread, (seeds, 1))
-    return rng.binomial(REPEATS, chance.clip(0, 1)) / REPEATS
+    """Return the successes (R, M, E) of fresh seeds, whose skill has the standard deviation spread."""
+    chance = 0.6 + levels + rng.normal(0, spread, (seeds, 1))  # (R, M)
+    return (rng.random((seeds, LEVELS, REPEATS)) < chance[..., None]).astype(float)
 
 
 def interval_level_by_level(scores: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return the ends (2,) of an interval that draws other seeds for each level, right only if levels share no seed."""
-    drawn = rng.integers(len(scores), size=(RESAMPLES, *scores.shape))
+    drawn = rng.integers(len(scores), size=(RESAMPLES, *scores.shape[:2], 1))  # (B, R, M, 1)
     return np.percentile(iqm(np.take_along_axis(scores[None], drawn, axis=1)), [2.5, 97.5])
 
 

@@ -203,7 +203,7 @@ def train(config: Config, task: Task, agent: str, seed: int) -> None:
 def curves(folders: list[str], metric: str) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield, of each run's evaluations, the steps (P,), the hours of training until then (P,), and the levels' scores.
 
-    The hours are without evaluations, the scores (P, M).
+    The hours are without evaluations, the scores (P, M, E): E episodes on each of M levels.
     """
     for folder in folders:
         run = evaluate.read_run(folder)
@@ -213,7 +213,7 @@ def curves(folders: list[str], metric: str) -> Iterator[tuple[np.ndarray, np.nda
 
 def row(agent: str, folders: list[str], metric: str, best: float) -> str:
     """Return the agent's row: its last score, and what it took to nine tenths of the best score of all agents."""
-    steps, hours, scores = map(np.stack, zip(*curves(folders, metric), strict=True))  # (R, P), (R, P), (R, P, M)
+    steps, hours, scores = map(np.stack, zip(*curves(folders, metric), strict=True))  # (R, P), (R, P), (R, P, M, E)
     last, ends = evaluate.iqm(scores[:, -1]), evaluate.interval(scores[:, -1])
     middle = evaluate.iqm(scores.swapaxes(0, 1))  # (P,)
     reached = np.flatnonzero(middle >= 0.9 * best)

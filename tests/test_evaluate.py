@@ -36,16 +36,17 @@ FEW = {"levels": 4, "repeats": 2, "cuda": False}
         ([[9, 1, 2, 3], [4, 5, 6, 50]], 4.5),
     ],
 )
-def test_interquartile_mean(scores, middle):
-    assert evaluate.iqm(np.array(scores, float)) == middle
+@pytest.mark.parametrize("shape", [(-1, 1), (1, -1)], ids=["levels", "episodes"])
+def test_interquartile_mean(scores, middle, shape):
+    assert evaluate.iqm(np.array(scores, float).reshape(len(scores), *shape)) == middle
 
 
 def test_interval_by_hand():
     """The IQM of four is the mean of the middle two: 0 if at least three are the worst seed's (5 %)."""
-    assert evaluate.interval(np.array([[0.0], [4.0], [8.0], [100.0]])).tolist() == [0, 100]
+    assert evaluate.interval(np.array([[[0.0]], [[4.0]], [[8.0]], [[100.0]]])).tolist() == [0, 100]
     # Two seeds, drawn whole: both the bad one (25 %), or both the good one (25 %). Drawn anew for each of the six
     # levels, an IQM of 0 would need at least nine of twelve to be bad (7 %), one of 1 as many good ones.
-    assert evaluate.interval(np.array([[0.0] * 6, [1.0] * 6])).tolist() == [0, 1]
+    assert evaluate.interval(np.array([[[0.0]] * 6, [[1.0]] * 6])).tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("scores", [[[0, 2], [4, 10], [5, 6], [1, 9]], [[0], [0], [3], [4], [8]]])
@@ -58,21 +59,31 @@ def test_interval_is_that_of_all_resamples(scores):
     every = [middle([score for seed in seeds for score in seed]) for seeds in drawn]
     low, high = np.quantile(every, [0.025, 0.975])
     assert min(every) < high < max(every), "the case tells the 95 % interval from the whole range"
-    assert evaluate.interval(np.array(scores, float)) == pytest.approx([low, high])
+    assert evaluate.interval(np.array(scores, float)[..., None]) == pytest.approx([low, high])
 
 
 def test_interval_for_every_point_of_a_curve():
-    scores = np.random.default_rng(1).normal(size=(3, 5, 4))
+    scores = np.random.default_rng(1).normal(size=(3, 5, 4, 2))
     each = np.stack([evaluate.interval(point) for point in scores], axis=-1)
     assert np.array_equal(evaluate.interval(scores), each)
     assert each.shape == (2, 3)
 
 
 def test_one_seed_has_no_interval():
-    assert evaluate.interval(np.zeros((1, 50))) is None
-    summary = evaluate.summary("gru", ["a"], {"return": np.array([[1.0, 2.0, 3.0, 4.0]])})
+    assert evaluate.interval(np.zeros((1, 50, 3))) is None
+    summary = evaluate.summary("gru", ["a"], {"return": np.array([[[0.0, 2.0], [2.0, 2.0]]])})
     assert summary["metrics"]["return"]["interval"] is None
-    assert evaluate.table([summary]).splitlines()[-1] == "| return | gru | 1 | 2.500 | 2.500 | none: one seed |"
+    told = "| return | gru | 1 | 1.500 | 2.000 | none: one seed | 1.500 | none: one seed |"
+    assert evaluate.table([summary]).splitlines()[-1] == told
+
+
+def test_iqm_of_episodes_and_of_level_means():
+    """Ten levels, ten episodes each, seven of them won: 0.9 of the middle half, and each level's mean is 0.7."""
+    won = np.tile([1.0] * 7 + [0.0] * 3, (2, 10, 1))
+    told = evaluate.summary("gru", ["a", "b"], {"success": won})["metrics"]["success"]
+    assert (told["mean"], told["iqm"], told["iqm_of_levels"]) == pytest.approx((0.7, 0.9, 0.7))
+    assert told["interval"] == pytest.approx([0.9, 0.9])
+    assert told["interval_of_levels"] == pytest.approx([0.7, 0.7])
 
 
 # ---- agents ----
@@ -167,37 +178,49 @@ def test_own_metric_is_told_by_the_environment(env_id):
 def test_curves_on_common_steps():
     steps, scores = evaluate.align(
         [
-            (np.array([0, 10, 20]), np.array([[0.0, 5.0], [1.0, 5.0], [3.0, 5.0]])),
-            (np.array([5, 15]), np.array([[4.0, 0.0], [8.0, 2.0]])),
+            (np.array([0, 10, 20]), np.array([[[0.0, 5.0]], [[1.0, 5.0]], [[3.0, 5.0]]])),
+            (np.array([5, 15]), np.array([[[4.0, 0.0]], [[8.0, 2.0]]])),
         ]
     )
     assert steps.tolist() == [5, 10, 15]
-    assert scores[..., 0].tolist() == [[0.5, 4], [1, 6], [2, 8]]
-    assert scores[..., 1].tolist() == [[5, 0], [5, 1], [5, 2]]
+    assert scores.shape == (3, 2, 1, 2)
+    assert scores[..., 0, 0].tolist() == [[0.5, 4], [1, 6], [2, 8]]
+    assert scores[..., 0, 1].tolist() == [[5, 0], [5, 1], [5, 2]]
 
 
-def test_curves_of_different_levels_are_compared_by_their_means():
-    runs = [(np.array([1, 2]), np.array([[0.0, 4.0], [2.0, 4.0]])), (np.array([1, 2]), np.array([[1.0], [5.0]]))]
-    assert evaluate.align(runs)[1].tolist() == [[[2], [1]], [[3], [5]]]
+@pytest.mark.parametrize("shape", [(2, 1, 2), (2, 2, 1)])
+def test_curves_of_different_levels_or_episodes_are_compared_by_their_means(shape):
+    runs = [
+        (np.array([1, 2]), np.array([0.0, 4.0, 2.0, 4.0]).reshape(shape)),
+        (np.array([1, 2]), np.array([[[1.0]], [[5.0]]])),
+    ]
+    assert evaluate.align(runs)[1][..., 0, 0].tolist() == [[2, 1], [3, 5]]
 
 
 def test_dense_curves_are_averaged():
     steps = np.arange(1, 10 * evaluate.POINTS + 1)
-    common, scores = evaluate.align([(steps, steps[:, None] * 2.0)])
+    common, scores = evaluate.align([(steps, steps[:, None, None] * 2.0)])
     assert len(common) == evaluate.POINTS
     assert common[0] == 5.5  # of 1 to 10
-    assert np.array_equal(scores[:, 0, 0], common * 2)
+    assert np.array_equal(scores[:, 0, 0, 0], common * 2)
 
 
 def test_curves_without_common_steps():
     with pytest.raises(ValueError, match="do not overlap; leave out the shortest run"):
-        evaluate.align([(np.array([1, 2]), np.zeros((2, 1))), (np.array([3]), np.zeros((1, 1)))])
+        evaluate.align([(np.array([1, 2]), np.zeros((2, 1, 1))), (np.array([3]), np.zeros((1, 1, 1)))])
 
 
 @pytest.fixture(scope="module")
 def agents(tiny, tmp_path_factory):
     """The run folders of two seeds of two agents, trained for two iterations with an evaluation after each."""
-    settings = {**TASK, "num_steps": 128, "total_timesteps": 1024, "eval_interval": 1, "eval_levels": 2}
+    settings = {
+        **TASK,
+        "num_steps": 128,
+        "total_timesteps": 1024,
+        "eval_interval": 1,
+        "eval_levels": 2,
+        "eval_repeats": 3,
+    }
     folder = tmp_path_factory.mktemp("agents")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -213,7 +236,9 @@ def test_curves_drawn(agents, scalars, capsys):
     assert [agent["agent"] for agent in task["agents"]] == ["ppo_gru", "ppo_trxl"]
     ends = [scalars(folder)["eval/length"][-1] for folder in agents[:2]]
     assert task["agents"][0]["metrics"]["eval/length"]["mean"] == pytest.approx(np.mean(ends))
-    assert np.mean(task["agents"][0]["metrics"]["eval/length"]["scores"], -1) == pytest.approx(ends), "of two levels"
+    scores = np.array(task["agents"][0]["metrics"]["eval/length"]["scores"])
+    assert scores.shape == (2, 2, 3)
+    assert scores.mean((1, 2)) == pytest.approx(ends)
     assert "| eval/length | ppo_gru | 2 |" in capsys.readouterr().out
 
 
@@ -245,8 +270,8 @@ def test_evaluations_are_shown_before_training_episodes(agents):
     runs = [evaluate.read_run(folder) for folder in agents]
     assert evaluate.curve_name("length", runs) == "eval/length"
     assert evaluate.curve_name("episode/length", runs[:1]) == "episode/length"
-    assert evaluate.read_curve(runs[0], "eval/length")[1].shape == (2, 2), "two evaluations of two levels"
-    assert evaluate.read_curve(runs[0], "episode/length")[1].shape == (2, 1)
+    assert evaluate.read_curve(runs[0], "eval/length")[1].shape == (2, 2, 3), "two evaluations, two levels, thrice each"
+    assert evaluate.read_curve(runs[0], "episode/length")[1].shape == (2, 1, 1)
 
 
 def test_the_arguments_of_an_older_run():
@@ -260,7 +285,19 @@ def test_the_arguments_of_an_older_run():
     defaults = {name: str(value) for name, value in asdict(ppo_gru.Args()).items()}
     changed = {"script": "ppo_gru", "seed": "3", "num_envs": "4", "env_id": "A-v0", "norm_adv": "minibatch"}
     assert evaluate.hyperparameters(run) == defaults | changed
-    assert [each.tolist() for each in evaluate.read_curve(run, "eval/return")] == [[10], [[2]]]
+    assert [each.tolist() for each in evaluate.read_curve(run, "eval/return")] == [[10], [[[2]]]]
+
+
+def test_the_levels_of_an_older_run():
+    """It kept each level's mean."""
+    with SummaryWriter("old") as writer:
+        writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|3|")
+        writer.add_scalar("eval/return", 2.0, 10)
+        writer.add_tensor("eval_levels/return", torch.tensor([1.0, 3.0]), 10)
+    assert [each.tolist() for each in evaluate.read_curve(evaluate.read_run("old"), "eval/return")] == [
+        [10],
+        [[[1], [3]]],
+    ]
 
 
 def test_the_arguments_of_a_run_of_another_script():
@@ -330,7 +367,7 @@ def test_curves_over_time_are_aligned_in_hours():
     (line,) = axis.lines
     assert line.get_xdata().tolist() == [2, 3], "as far as both reach"
     assert line.get_ydata().tolist() == [1.5, 2.25]
-    assert last["gru"].tolist() == [[3], [1.5]]
+    assert last["gru"].tolist() == [[[3]], [[1.5]]]
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("hours of training", "charts/episodic_return")
     assert axis.xaxis.get_major_formatter()(0.025) == "0.025"
 
@@ -391,7 +428,7 @@ def test_scores_are_those_of_the_levels(agents, capsys):
     assert (trxl["agent"], trxl["runs"]) == ("ppo_trxl", list(models[2:]))
     assert list(gru["metrics"]) == ["success", "return", "length", "num_fails"]
     falls = np.array(trxl["metrics"]["num_fails"]["scores"])
-    assert falls.shape == (2, 4)
+    assert falls.shape == (2, 4, 2)
     low, high = trxl["metrics"]["num_fails"]["interval"]
     assert low <= trxl["metrics"]["num_fails"]["iqm"] <= high
     assert f"| num_fails | ppo_trxl | 2 | {falls.mean():.3f} |" in said
@@ -404,8 +441,8 @@ def test_scores_are_those_of_the_levels(agents, capsys):
     ppo_trxl.load_weights(agent, saved, models[2])
     torch.manual_seed(1)
     found = ppo_trxl.evaluate(agent, envs, args)["num_fails"]
-    assert falls[0].tolist() == [np.mean(found[2 * level : 2 * level + 2]) for level in range(4)]
-    assert len(set(falls[0])) > 1, "levels that can be told apart"
+    assert falls[0].tolist() == [[found[2 * level], found[2 * level + 1]] for level in range(4)]
+    assert len({tuple(level) for level in falls[0]}) > 1, "levels that can be told apart"
 
 
 def test_a_checkpoint_is_read_once(agents, monkeypatch):
