@@ -17,6 +17,7 @@ Shape letters: R seeds (training runs) of an agent, M levels, E episodes on each
 curve, B bootstrap resamples.
 """
 
+import gzip
 import itertools
 import json
 import logging
@@ -99,7 +100,7 @@ class Config:
     """write the scores to this file too, down to each episode's"""
 
     curves: tuple[str, ...] = ()
-    """run folders whose curves to draw, instead of playing"""
+    """run folders whose curves to draw, instead of playing; or files, *.json.gz, that benchmarks/learning.py wrote"""
     over: Literal["steps", "time"] = "steps"
     """what curves are drawn over: environment steps, or hours of training without evaluations"""
     out: str = "curves"
@@ -228,84 +229,115 @@ def labels(agents: list[dict[str, Any]]) -> list[str]:
 
 
 # ---- CURVES ----
-def read_run(folder: str) -> EventAccumulator:
-    """Read a run folder's TensorBoard files; raise ValueError if there is none or it holds no curves."""
-    if not os.path.isdir(folder):
-        raise ValueError(f"there is no run folder {folder}")
+@dataclass
+class Run:
+    """What a training run logged. A curve is steps (P,) and values (P, M, E), by the name of its TensorBoard scalar.
+
+    Of evaluations it has every episode. Runs of earlier versions kept the levels' means (E = 1); of losses and training
+    episodes there is one number a step (M = E = 1).
+    """
+
+    path: str
+    args: dict[str, str]  # the script's name and its arguments, as text
+    curves: dict[str, tuple[np.ndarray, np.ndarray]]
+
+    def seconds(self, name: str) -> np.ndarray:
+        """Return the seconds (I,) of each iteration: a name in SECONDS."""
+        return self.curves[SECONDS[name]][1][:, 0, 0]
+
+    def hours(self, steps: np.ndarray) -> np.ndarray:
+        """Return the hours (P,) that it had been training for at these steps (P,), interpolated within iterations."""
+        ends = self.curves[SECONDS["iteration"]][0]
+        return np.interp(steps, [0, *ends], [0, *np.cumsum(self.seconds("iteration")) / 3600])
+
+    def has_seconds(self) -> bool:
+        """Return whether it has the seconds of its iterations, which runs of earlier versions do not have."""
+        return set(SECONDS.values()) <= set(self.curves)
+
+
+def read_run(path: str) -> Run:
+    """Read a run folder's TensorBoard files, or a file of `write_run`; raise ValueError if it holds no curves."""
+    if path.endswith(".json.gz"):
+        try:
+            with gzip.open(path, "rt") as file:
+                saved = json.load(file)
+            curves = {name: (np.array(steps), np.array(values)) for name, (steps, values) in saved["curves"].items()}
+            return Run(path, with_defaults(saved["args"]), curves)
+        except (KeyError, TypeError, ValueError, EOFError, gzip.BadGzipFile):
+            raise ValueError(f"{path} holds no curves of a training run") from None
+    if not os.path.isdir(path):
+        raise ValueError(f"there is no run folder {path}")
     logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it warns of a crash where a run was resumed
-    events = EventAccumulator(folder, size_guidance={"scalars": 0, "tensors": 0})
+    events = EventAccumulator(path, size_guidance={"scalars": 0, "tensors": 0})
     events.Reload()
     tags = events.Tags()
     if not tags["scalars"] or "hyperparameters/text_summary" not in tags["tensors"]:
-        raise ValueError(f"{folder} holds no curves of a training run")
-    return events
+        raise ValueError(f"{path} holds no curves of a training run")
+    return Run(path, hyperparameters(events), event_curves(events))
+
+
+def event_curves(events: EventAccumulator) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return the curves in a run's TensorBoard files. There is no point where a scalar is not a finite number.
+
+    Of steps that a resumed run played twice, the last count.
+    """
+    points = {}  # by name, values (M, E) by step
+    for name in events.Tags()["scalars"]:
+        found = {point.step: np.full((1, 1), point.value) for point in events.Scalars(name)}
+        points[name] = {step: value for step, value in found.items() if np.isfinite(value)}
+    for name in events.Tags()["tensors"]:
+        if name.startswith("eval_levels/"):
+            found = {point.step: make_ndarray(point.tensor_proto) for point in events.Tensors(name)}
+            points[name.replace("eval_levels/", "eval/")] = {
+                step: scores.reshape(len(scores), -1) for step, scores in found.items()
+            }
+    return {name: (np.array([*each]), np.array([*each.values()])) for name, each in points.items() if each}
 
 
 def hyperparameters(events: EventAccumulator) -> dict[str, str]:
     """Return a run's arguments as text, from the Markdown table in its TensorBoard file.
 
-    An argument that is younger than the run has its default, one that no longer exists is left out. A resumed run has
-    written them more than once; the last ones count.
+    A resumed run has written them more than once; the last ones count.
     """
     rows = events.Tensors("hyperparameters/text_summary")[-1].tensor_proto.string_val[0].decode().splitlines()[2:]
-    given = dict(row[1:-1].split("|", 1) for row in rows)
+    return with_defaults(dict(row[1:-1].split("|", 1) for row in rows))
+
+
+def with_defaults(given: dict[str, str]) -> dict[str, str]:
+    """Return a run's arguments as today's version has them.
+
+    An argument that is younger than the run has its default, one that no longer exists is left out.
+    """
     if given.get("norm_adv") in ("True", "False"):  # before it was a choice
-        given["norm_adv"] = "minibatch" if given["norm_adv"] == "True" else "none"
-    name = given.pop("script", "ppo_trxl" if "trxl_dim" in given else "ppo_gru")  # an older run does not say it
+        given = given | {"norm_adv": "minibatch" if given["norm_adv"] == "True" else "none"}
+    name = given.get("script", "ppo_trxl" if "trxl_dim" in given else "ppo_gru")  # an older run does not say it
     defaults = asdict(SCRIPTS[name].Args()) if name in SCRIPTS else given
     return {"script": name} | {key: given.get(key, str(value)) for key, value in defaults.items()}
 
 
-def curve_name(metric: str, runs: list[EventAccumulator]) -> str:
-    """Return the scalar that shows the metric in every one of the runs, of evaluations rather than training episodes.
+def write_run(run: Run, path: str) -> None:
+    """Write a run's arguments, its evaluations in the family's own metric, return and length, and its seconds.
+
+    That is what tables and pictures need, in a few KB: `read_run` reads it as it reads the run's folder.
+    """
+    names = [f"eval/{name}" for name in (own_metric(run.args["env_id"]), "return", "length")] + [*SECONDS.values()]
+    kept = {name: run.curves[name] for name in dict.fromkeys(names) if name in run.curves}
+    curves = {name: (steps.tolist(), values.round(4).tolist()) for name, (steps, values) in kept.items()}
+    with gzip.open(path, "wt") as file:
+        json.dump({"args": run.args, "curves": curves}, file, separators=(",", ":"))
+
+
+def curve_name(metric: str, runs: list[Run]) -> str:
+    """Return the curve that shows the metric in every one of the runs, of evaluations rather than training episodes.
 
     Raises ValueError if there is none.
     """
-    common = set.intersection(*(set(run.Tags()["scalars"]) for run in runs))
+    common = set.intersection(*(set(run.curves) for run in runs))
     for name in (metric, f"eval/{metric}", f"episode/{metric}", f"charts/episodic_{metric}"):
         if name in common:
             return name
     known = ", ".join(sorted(name for name in common if name.startswith(("eval/", "episode/", "charts/episodic_"))))
     raise ValueError(f"the runs have no curve of {metric} in common; they all have {known or 'none of an episode yet'}")
-
-
-def read_curve(run: EventAccumulator, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the steps (P,) and values (P, M, E) of a curve: of every episode where the evaluations kept them.
-
-    Earlier versions kept the levels' means (E = 1), and training episodes are averaged (M = E = 1). Raises ValueError
-    if a scalar is nowhere a number; where it is none, there is no point.
-    """
-    levels = name.replace("eval/", "eval_levels/")
-    if levels != name and levels in run.Tags()["tensors"]:
-        # Of steps that were done again after a resume, TensorBoard's reader keeps both tensors, unlike scalars.
-        points = {point.step: make_ndarray(point.tensor_proto) for point in run.Tensors(levels)}.items()
-    else:
-        points = [(point.step, [point.value]) for point in run.Scalars(name) if np.isfinite(point.value)]
-    if not points:
-        raise ValueError(f"{run.path} has no number in its curve of {name}")
-    steps, values = zip(*points, strict=True)
-    values = np.array(values)  # (P, M, E) or (P, M)
-    return np.array(steps), values if values.ndim == 3 else values[..., None]
-
-
-def read_seconds(run: EventAccumulator, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the steps (I,) at which a run's iterations ended, and the seconds (I,) of each: a name in SECONDS.
-
-    Steps that a resumed run played twice are there once: TensorBoard's reader drops the first ones.
-    """
-    points = run.Scalars(SECONDS[name])
-    return np.array([point.step for point in points]), np.array([point.value for point in points])
-
-
-def has_seconds(run: EventAccumulator) -> bool:
-    """Return whether a run has the seconds of its iterations, which runs of earlier versions do not have."""
-    return set(SECONDS.values()) <= set(run.Tags()["scalars"])
-
-
-def training_hours(run: EventAccumulator, steps: np.ndarray) -> np.ndarray:
-    """Return the hours (P,) that a run had been training for at these steps (P,), interpolated within iterations."""
-    ends, seconds = read_seconds(run, "iteration")
-    return np.interp(steps, [0, *ends], [0, *np.cumsum(seconds) / 3600])
 
 
 def align(runs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
@@ -330,15 +362,13 @@ def align(runs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.nda
     return np.array([common[part].mean() for part in parts]), scores
 
 
-def draw_metric(
-    axis: Axes, name: str, agents: dict[str, list[EventAccumulator]], over: str = "steps"
-) -> dict[str, np.ndarray]:
+def draw_metric(axis: Axes, name: str, agents: dict[str, list[Run]], over: str = "steps") -> dict[str, np.ndarray]:
     """Draw a curve of every agent, its runs by label, over steps or time; return each one's last scores (R, M, E)."""
     last = {}
     for (label, runs), color in zip(agents.items(), itertools.cycle(color_sequences["petroff10"]), strict=False):
-        curves = [read_curve(run, name) for run in runs]
+        curves = [run.curves[name] for run in runs]
         if over == "time":
-            curves = [(training_hours(run, steps), values) for run, (steps, values) in zip(runs, curves, strict=True)]
+            curves = [(run.hours(steps), values) for run, (steps, values) in zip(runs, curves, strict=True)]
         x, scores = align(curves)
         marker = "o" if len(x) == 1 else None  # a line of one point is not to be seen
         seeds = f"{len(runs)} seed{'s' * (len(runs) > 1)}"
@@ -354,17 +384,15 @@ def draw_metric(
     return last
 
 
-def wall_time(runs: list[EventAccumulator]) -> dict[str, float]:
+def wall_time(runs: list[Run]) -> dict[str, float]:
     """Return an agent's wall time by name, for JSON, as in the thesis' tables 6.3 and 6.4.
 
     mean to max: seconds of one iteration, over all iterations of all runs. collect, update: means of its two parts.
     hours: the mean duration of a training.
     """
-    durations = [read_seconds(run, "iteration")[1] for run in runs]
+    durations = [run.seconds("iteration") for run in runs]
     seconds = np.concatenate(durations)  # of all runs' iterations
-    parts = {
-        name: np.mean(np.concatenate([read_seconds(run, name)[1] for run in runs])) for name in ("collect", "update")
-    }
+    parts = {name: np.concatenate([run.seconds(name) for run in runs]).mean() for name in ("collect", "update")}
     numbers = {
         "mean": seconds.mean(),
         "std": seconds.std(),
@@ -389,16 +417,16 @@ def time_table(agents: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def read_runs(config: Config) -> dict[str, EventAccumulator]:
-    """Read the run folders; raise ValueError for one that cannot be drawn."""
-    events = {path: read_run(path) for path in dict.fromkeys(config.curves)}
-    older = [path for path, run in events.items() if not has_seconds(run)]
+def read_runs(config: Config) -> dict[str, Run]:
+    """Read the runs; raise ValueError for one that cannot be drawn."""
+    runs = {path: read_run(path) for path in dict.fromkeys(config.curves)}
+    older = [path for path, run in runs.items() if not run.has_seconds()]
     if config.over == "time" and older:
         raise ValueError(
             f"{older[0]} has no {SECONDS['iteration']}, since an earlier version trained it; draw it --over steps, or "
             "leave it out"
         )
-    return events
+    return runs
 
 
 def draw_curves(config: Config) -> list[dict[str, Any]]:
@@ -406,17 +434,16 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
 
     Wall times are printed and returned of the agents whose runs all have them.
     """
-    events = read_runs(config)
-    args = {path: hyperparameters(run) for path, run in events.items()}
-    tasks = tasks_of(args, task_of)
+    every = read_runs(config)
+    tasks = tasks_of({path: run.args for path, run in every.items()}, task_of)
     columns = len(config.metrics) or 1
     legend = 0.22 * max(map(len, tasks.values()))  # inches below the curves
     figure = Figure(figsize=(5.5 * columns, (3.8 + legend) * len(tasks)), layout="constrained")
     report = []
     for axes, (title, agents) in zip(figure.subplots(len(tasks), columns, squeeze=False), tasks.items(), strict=True):
-        runs = {label: [events[path] for path in paths] for label, paths in agents.items()}
+        runs = {label: [every[path] for path in paths] for label, paths in agents.items()}
         last = defaultdict(dict)
-        env_id = next(args[path]["env_id"] for paths in agents.values() for path in paths)
+        env_id = next(run.args["env_id"] for members in runs.values() for run in members)
         for axis, metric in zip(axes, config.metrics or [own_metric(env_id)], strict=True):
             name = curve_name(metric, list(itertools.chain(*runs.values())))
             for label, scores in draw_metric(axis, name, runs, config.over).items():
@@ -425,7 +452,7 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
         axes[0].legend(loc="upper left", bbox_to_anchor=(0, -0.17), frameon=False)  # below, clear of the curves
         summaries = [summary(label, agents[label], last[label]) for label in agents]
         for each in summaries:
-            if all(map(has_seconds, runs[each["agent"]])):
+            if all(run.has_seconds() for run in runs[each["agent"]]):
                 each["wall_time"] = wall_time(runs[each["agent"]])
         report.append({"task": title, "agents": summaries})
         print(f"{title}, where the curves end\n\n{table(summaries)}\n")

@@ -1,31 +1,37 @@
-"""Does memory matter, and which one? Trains agents on small tasks, and tabulates what they reach.
+"""Does memory matter, and which one? Trains agents on a suite of tasks, and tabulates what they reach.
 
-    python benchmarks/learning.py --jobs 2 --out docs/learning
+    python benchmarks/learning.py --out docs/learning
     python benchmarks/learning.py --tasks endless-mortar-mayhem --agents GRU TrXL "TrXL, gradient" --steps-scale 6
+    python benchmarks/learning.py --suite full --results benchmarks/results
 
-Vector observations and small networks, so that a run takes minutes on a core. Every agent sees the same vectors, the
-stack the last four of them. Scores are those of evaluations during training, on levels outside the training set
-(6.1.3). A run that is there already, whole, is not trained again, and one that was stopped goes on.
+The small suite has tasks that take minutes on a core; the full one has the ten environments as they are. Agents have
+vector observations and small networks, and all see the same vectors, a stack the last ones. Scores are those of
+evaluations during training, on levels outside the training set (6.1.3).
+
+What a run reached is kept in a file of some KB in --results, which `evaluate.py --curves` can draw too. A run whose
+file is there is not trained again; one that was stopped goes on from its last checkpoint in --folder.
 """
 
+import contextlib
 import glob
 import importlib
 import json
+import math
 import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tqdm import tqdm
 
 import evaluate
+import memory_gym_envs
 
 ROOT = Path(__file__).parent.parent
 COMMON = "--preset laptop --save-model"
@@ -38,6 +44,8 @@ MEMORIES = {
 AGENTS = {
     "no memory": "ppo_gru.py --memory none",
     "stack of 4": "ppo_gru.py --memory none --frame-stack 4",
+    "stack of 16": "ppo_gru.py --memory none --frame-stack 16",
+    "step encoding": "ppo_gru.py --memory none --step-encoding",
     **MEMORIES,
     **{f"{name}, refreshed": f"{flags} --refresh-memory" for name, flags in MEMORIES.items()},
     **{f"{name}, gradient": f"{MEMORIES[name]} --trxl-memory-gradient" for name in ("TrXL", "GTrXL")},
@@ -50,19 +58,24 @@ AGENTS = {
 
 @dataclass(frozen=True)
 class Task:
-    """A task that is learned within minutes, and how."""
+    """A task, and how it is learned."""
 
     env_id: str
-    options: dict
-    metric: str  # the family's own (6.1.3)
     total_timesteps: int
-    flags: str
+    options: dict = field(default_factory=dict)
+    flags: str = ""
     trxl_flags: str = ""  # the transformer's own
 
+    @property
+    def metric(self) -> str:
+        """Return the name of the family's own metric (6.1.3)."""
+        return evaluate.own_metric(self.env_id)
 
-TASKS = {
+
+SMALL = {
     "mortar-mayhem": Task(
         "MortarMayhem-Grid-v0",
+        1_000_000,
         # Four commands instead of ten, each shown for one step, and two thirds of the time to carry one out.
         {
             "command_count": [4],
@@ -71,17 +84,13 @@ TASKS = {
             "explosion_delay": [4],
             "explosion_duration": [2],
         },
-        "commands_completed",
-        1_000_000,
-        "",
     ),
     "mystery-path": Task(
         "MysteryPath-Grid-v0",
+        1_500_000,
         # All paths begin at the left, and each of their tiles pays a tenth of the goal's reward when first reached:
         # without this, chance finds too few goals.
         {"cardinal_origin_choice": [0], "reward_path_progress": 0.1},
-        "success",
-        1_500_000,
         # To remember tiles, an agent has to tell them apart; their coordinates alone differ by a seventh.
         "--vector-frequencies 4",
         # Where the agent fell matters, not when.
@@ -89,6 +98,7 @@ TASKS = {
     ),
     "endless-mortar-mayhem": Task(
         "Endless-MortarMayhem-v0",
+        1_000_000,
         # A step crosses a tile, as on the grid; a new command is shown for one step, and carrying one out takes four:
         # an episode with twenty commands carried out has about ninety steps.
         {
@@ -99,9 +109,15 @@ TASKS = {
             "command_show_duration": [1],
             "command_show_delay": [0],
         },
-        "commands_completed",
-        1_000_000,
-        "",
+    ),
+}
+FULL = {env_id: Task(env_id, 10_000_000) for env_id in memory_gym_envs.IDS}
+TASKS = SMALL | FULL
+SUITES = {
+    "small": (SMALL, ("no memory", "stack of 4", "GRU", "TrXL")),
+    "full": (
+        FULL,
+        ("no memory", "stack of 4", "stack of 16", "step encoding", *MEMORIES, "TrXL --trxl-query-position"),
     ),
 }
 
@@ -110,20 +126,25 @@ TASKS = {
 class Config:
     """What to train and to draw."""
 
-    tasks: tuple[str, ...] = tuple(TASKS)
-    """of those that this program knows"""
-    agents: tuple[str, ...] = ("no memory", "stack of 4", "GRU", "TrXL")
-    """of those that this program knows, each alone or with further flags, e.g. "TrXL --trxl-num-layers 3" """
+    suite: Literal["small", "full"] = "small"
+    """tasks that are learned within minutes, or the ten environments with their default options"""
+    tasks: tuple[str, ...] = ()
+    """other tasks than the suite's, of those that this program knows"""
+    agents: tuple[str, ...] = ()
+    """other agents than the suite's, of those that this program knows, each alone or with further flags, e.g.
+    "TrXL --trxl-num-layers 3" """
     steps_scale: float = 1.0
     """share of a task's steps to train for"""
     seeds: tuple[int, ...] = (1, 2, 3)
     """a training run each"""
-    jobs: int = 1
+    jobs: int = os.cpu_count() or 1
     """runs at the same time; they share the cores"""
     evaluations: int = 20
     """points of a curve"""
     folder: Path = Path("learning")
     """where the runs go"""
+    results: Path = Path("learning/results")
+    """where a file of some KB goes for every run that came to its end"""
     out: Path = Path("learning/curves")
     """draw the curves to OUT.png and OUT.svg"""
 
@@ -158,25 +179,24 @@ def parsed(script: str, flags: list[str]) -> Any:
     return importlib.import_module(Path(script).stem).parse_args(flags)
 
 
-def folders_of(config: Config, task: Task, agent: str, seed: int) -> dict[str, bool]:
-    """Return the folders of such runs, and whether each came to its end: it was evaluated then."""
-    line, found = command(config, task, agent, seed), {}
-    wanted, args = arguments(line), parsed(Path(line[1]).name, line[2:])
-    for folder in sorted(glob.glob(f"{config.folder}/runs/{task.env_id}__{file_name(agent)}__{seed}__*")):
-        run = EventAccumulator(folder, size_guidance={"scalars": 0})
-        run.Reload()
-        if "hyperparameters/text_summary" not in run.Tags()["tensors"]:
-            continue  # stopped before its first step
-        if {**evaluate.hyperparameters(run), "resume": "None"} == wanted:
-            evaluated = f"eval/{task.metric}" in run.Tags()["scalars"]
-            last = run.Scalars(f"eval/{task.metric}")[-1].step if evaluated else 0
-            found[folder] = last + args.num_envs * args.num_steps > steps_of(config, task)
-    return found
+def runs_in(place: str, config: Config, task: Task, agent: str, seed: int) -> list[evaluate.Run]:
+    """Return the runs with these arguments among the folders, or the files of results, in a place."""
+    wanted, found = arguments(command(config, task, agent, seed)), []
+    for path in sorted(glob.glob(f"{place}/{task.env_id}__{file_name(agent)}__{seed}__*")):
+        with contextlib.suppress(ValueError):  # one that was stopped in its first iteration
+            found.append(evaluate.read_run(path))
+    return [run for run in found if {**run.args, "resume": "None"} == wanted]
 
 
-def folder_of(config: Config, task: Task, agent: str, seed: int) -> str | None:
-    """Return the folder of such a run that came to its end, if there is one."""
-    return next((folder for folder, whole in folders_of(config, task, agent, seed).items() if whole), None)
+def result_of(config: Config, task: Task, agent: str, seed: int) -> evaluate.Run | None:
+    """Return such a run that came to its end, if its result is there."""
+    return next(iter(runs_in(str(config.results), config, task, agent, seed)), None)
+
+
+def is_whole(run: evaluate.Run) -> bool:
+    """Return whether a run came to its end: it was evaluated then."""
+    total, *batch = (int(run.args[name]) for name in ("total_timesteps", "num_envs", "num_steps"))
+    return "eval/return" in run.curves and run.curves["eval/return"][0][-1] + math.prod(batch) > total
 
 
 def arguments(line: list[str]) -> dict[str, str]:
@@ -188,32 +208,52 @@ def arguments(line: list[str]) -> dict[str, str]:
 def train(config: Config, task: Task, agent: str, seed: int) -> None:
     """Run a training, or go on with one that was stopped; raise SystemExit that names its output's file if it fails."""
     line = command(config, task, agent, seed)
-    for folder in folders_of(config, task, agent, seed):
-        if glob.glob(f"{folder}/checkpoint-*.pt"):
-            line = [*line[:2], "--resume", os.path.relpath(folder, config.folder)]
+    for run in runs_in(f"{config.folder}/runs", config, task, agent, seed):
+        if glob.glob(f"{run.path}/checkpoint-*.pt"):
+            line = [*line[:2], "--resume", os.path.relpath(run.path, config.folder)]
     threads = str(max(1, (os.cpu_count() or 1) // config.jobs))
     log = config.folder / f"{task.env_id}-{file_name(agent)}-{seed}.log"
     environment = {**os.environ, "OMP_NUM_THREADS": threads, "TQDM_MININTERVAL": "10"}
     with log.open("a") as output:
         if subprocess.run(line, cwd=config.folder, env=environment, stdout=output, stderr=output).returncode:
             raise SystemExit(f"{agent} on {task.env_id}, seed {seed}, failed: see {log}")
-    print(f"trained {agent} on {task.env_id}, seed {seed}", flush=True)
+    tqdm.write(f"trained {agent} on {task.env_id}, seed {seed}")
 
 
-def curves(folders: list[str], metric: str) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield, of each run's evaluations, the steps (P,), the hours of training until then (P,), and the levels' scores.
+def write_result(config: Config, task: Task, agent: str, seed: int) -> None:
+    """Train if that has not been done, and write what the run reached; raise SystemExit if it is not at its end."""
+    wanted = (f"{config.folder}/runs", config, task, agent, seed)
+    if not any(map(is_whole, runs_in(*wanted))):
+        train(config, task, agent, seed)
+    whole = [run for run in runs_in(*wanted) if is_whole(run)]
+    if not whole:
+        raise SystemExit(f"{agent} on {task.env_id}, seed {seed}, was stopped; the same command goes on with it")
+    evaluate.write_run(whole[0], f"{config.results}/{Path(whole[0].path).name}.json.gz")
 
-    The hours are without evaluations, the scores (P, M, E): E episodes on each of M levels.
-    """
-    for folder in folders:
-        run = evaluate.read_run(folder)
-        steps, scores = evaluate.read_curve(run, f"eval/{metric}")
-        yield steps, evaluate.training_hours(run, steps), scores
+
+def train_all(config: Config, missing: list[tuple[Task, str, int]]) -> None:
+    """Do the trainings, some at a time, and show how long it takes; raise SystemExit at the end if some failed."""
+    steps, failed = sum(steps_of(config, task) for task, _, _ in missing), []
+    with ThreadPoolExecutor(config.jobs) as pool, tqdm(total=steps, unit=" steps", unit_scale=True) as bar:
+        trainings = {pool.submit(write_result, config, *run): run[0] for run in missing}
+        try:
+            for training in as_completed(trainings):
+                if (error := training.exception()) is not None:
+                    failed.append(str(error))
+                    tqdm.write(failed[-1])
+                bar.update(steps_of(config, trainings[training]))
+        except KeyboardInterrupt:
+            pool.shutdown(cancel_futures=True)
+            raise
+    if failed:
+        raise SystemExit("; ".join(failed))
 
 
-def row(agent: str, folders: list[str], metric: str, best: float) -> str:
+def row(agent: str, runs: list[evaluate.Run], metric: str, best: float) -> str:
     """Return the agent's row: its last score, and what it took to nine tenths of the best score of all agents."""
-    steps, hours, scores = map(np.stack, zip(*curves(folders, metric), strict=True))  # (R, P), (R, P), (R, P, M, E)
+    curves = [run.curves[f"eval/{metric}"] for run in runs]
+    steps, scores = map(np.stack, zip(*curves, strict=True))  # (R, P), (R, P, M, E)
+    hours = np.stack([run.hours(each) for run, each in zip(runs, steps, strict=True)])  # (R, P), without evaluations
     last, ends = evaluate.iqm(scores[:, -1]), evaluate.interval(scores[:, -1])
     middle = evaluate.iqm(scores.swapaxes(0, 1))  # (P,)
     reached = np.flatnonzero(middle >= 0.9 * best)
@@ -223,36 +263,40 @@ def row(agent: str, folders: list[str], metric: str, best: float) -> str:
     mean = scores[:, -1].mean()
     span = "none: one seed" if ends is None else "{:.2f} to {:.2f}".format(*ends)
     whole = f"{60 * hours[:, -1].mean():.1f}"
-    return f"| {agent} | {len(folders)} | {mean:.2f} | {last:.2f} | {span} | {taken[0]} | {taken[1]} | {whole} |"
+    return f"| {agent} | {len(runs)} | {mean:.2f} | {last:.2f} | {span} | {taken[0]} | {taken[1]} | {whole} |"
 
 
-def report(config: Config, name: str) -> None:
-    """Print a task's table."""
-    task = TASKS[name]
-    folders = {agent: [folder_of(config, task, agent, seed) for seed in config.seeds] for agent in config.agents}
-    scores = [evaluate.iqm(np.stack([c[2][-1] for c in curves(each, task.metric)])) for each in folders.values()]
+def report(config: Config, task: Task, runs: dict[str, list[evaluate.Run]]) -> None:
+    """Print a task's table: each agent's runs, an evaluated seed each."""
+    curves = [[run.curves[f"eval/{task.metric}"][1] for run in each] for each in runs.values()]  # of (P, M, E)
+    best = max(evaluate.iqm(np.stack([curve[-1] for curve in each])) for each in curves)
     print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {steps_of(config, task):,} steps\n")
     print("| agent | seeds | mean | IQM | 95 % interval | steps to 0.9 of the best | minutes | minutes in all |")
     print("|---|---:|---:|---:|---|---:|---:|---:|")
-    for agent, each in folders.items():
-        print(row(agent, each, task.metric, float(max(scores))))
+    for agent, each in runs.items():
+        print(row(agent, each, task.metric, float(best)))
 
 
 def main(config: Config) -> None:
     """Train what is missing, then print the tables and draw the curves."""
     if config.steps_scale <= 0:
         raise SystemExit(f"--steps-scale is {config.steps_scale}; it must be above 0")
-    for given, known in ((config.tasks, TASKS), ([agent.partition(" --")[0] for agent in config.agents], AGENTS)):
+    tasks, agents = (
+        given or usual for given, usual in zip((config.tasks, config.agents), SUITES[config.suite], strict=True)
+    )
+    for given, known in ((tasks, TASKS), ([agent.partition(" --")[0] for agent in agents], AGENTS)):
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"there is no {unknown[0]}; there are {', '.join(known)}")
-    config.folder.mkdir(parents=True, exist_ok=True)
-    wanted = [(TASKS[task], agent, seed) for task in config.tasks for seed in config.seeds for agent in config.agents]
-    missing = [run for run in wanted if folder_of(config, *run) is None]
-    with ThreadPoolExecutor(config.jobs) as pool:
-        list(pool.map(lambda run: train(config, *run), missing))
-    for task in config.tasks:
-        report(config, task)
-    evaluate.draw_curves(evaluate.Config(curves=tuple(folder_of(config, *run) for run in wanted), out=str(config.out)))
+    for folder in (config.folder, config.results):
+        folder.mkdir(parents=True, exist_ok=True)
+    wanted = [(TASKS[task], agent, seed) for task in tasks for seed in config.seeds for agent in agents]
+    train_all(config, [run for run in wanted if result_of(config, *run) is None])
+    paths = []
+    for task in map(TASKS.get, tasks):
+        runs = {agent: [result_of(config, task, agent, seed) for seed in config.seeds] for agent in agents}
+        report(config, task, runs)
+        paths += [run.path for each in runs.values() for run in each]
+    evaluate.draw_curves(evaluate.Config(curves=tuple(paths), out=str(config.out)))
 
 
 if __name__ == "__main__":

@@ -83,9 +83,9 @@ def comes_to_its_end(script: str, flags: list[str], seconds: float | None) -> bo
 
 def scalars(folder: Path) -> dict[str, list]:
     """Return the curves of a run, of each level where it was evaluated, but for what a clock measures."""
-    run = evaluate.read_run(str(folder))
-    names = [name for name in run.Tags()["scalars"] if not name.startswith(("charts/SPS", "charts/seconds"))]
-    return {name: [array.tolist() for array in evaluate.read_curve(run, name)] for name in names}
+    curves = evaluate.read_run(str(folder)).curves
+    kept = [name for name in curves if not name.startswith(("charts/SPS", "charts/seconds"))]
+    return {name: [array.tolist() for array in curves[name]] for name in kept}
 
 
 def kill(config: Config) -> None:

@@ -263,15 +263,15 @@ def test_hyperparameters_are_those_of_the_run(agents):
         script = ppo_trxl if "trxl" in folder else ppo_gru
         args = script.saved_args(script.read_model(f"{folder}/model.pt"))
         text = {name: str(value) for name, value in asdict(args).items()}
-        assert evaluate.hyperparameters(evaluate.read_run(folder)) == {"script": script.__name__} | text
+        assert evaluate.read_run(folder).args == {"script": script.__name__} | text
 
 
 def test_evaluations_are_shown_before_training_episodes(agents):
     runs = [evaluate.read_run(folder) for folder in agents]
     assert evaluate.curve_name("length", runs) == "eval/length"
     assert evaluate.curve_name("episode/length", runs[:1]) == "episode/length"
-    assert evaluate.read_curve(runs[0], "eval/length")[1].shape == (2, 2, 3), "two evaluations, two levels, thrice each"
-    assert evaluate.read_curve(runs[0], "episode/length")[1].shape == (2, 1, 1)
+    assert runs[0].curves["eval/length"][1].shape == (2, 2, 3), "two evaluations, two levels, thrice each"
+    assert runs[0].curves["episode/length"][1].shape == (2, 1, 1)
 
 
 def test_the_arguments_of_an_older_run():
@@ -284,8 +284,8 @@ def test_the_arguments_of_an_older_run():
     run = evaluate.read_run("old")
     defaults = {name: str(value) for name, value in asdict(ppo_gru.Args()).items()}
     changed = {"script": "ppo_gru", "seed": "3", "num_envs": "4", "env_id": "A-v0", "norm_adv": "minibatch"}
-    assert evaluate.hyperparameters(run) == defaults | changed
-    assert [each.tolist() for each in evaluate.read_curve(run, "eval/return")] == [[10], [[[2]]]]
+    assert run.args == defaults | changed
+    assert [each.tolist() for each in run.curves["eval/return"]] == [[10], [[[2]]]]
 
 
 def test_the_levels_of_an_older_run():
@@ -294,7 +294,7 @@ def test_the_levels_of_an_older_run():
         writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|3|")
         writer.add_scalar("eval/return", 2.0, 10)
         writer.add_tensor("eval_levels/return", torch.tensor([1.0, 3.0]), 10)
-    assert [each.tolist() for each in evaluate.read_curve(evaluate.read_run("old"), "eval/return")] == [
+    assert [each.tolist() for each in evaluate.read_run("old").curves["eval/return"]] == [
         [10],
         [[[1], [3]]],
     ]
@@ -304,7 +304,7 @@ def test_the_arguments_of_a_run_of_another_script():
     with SummaryWriter("other") as writer:
         writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|script|ppo_other|\n|seed|3|")
         writer.add_scalar("eval/return", 2.0, 10)
-    assert evaluate.hyperparameters(evaluate.read_run("other")) == {"script": "ppo_other", "seed": "3"}
+    assert evaluate.read_run("other").args == {"script": "ppo_other", "seed": "3"}
 
 
 def test_a_model_of_another_script():
@@ -340,7 +340,7 @@ def write_old_events(folder, seed):
 
 def test_hours_of_training():
     run = evaluate.read_run(write_events("a", 1, [(900, 900), (2700, 900), (0, 1800)]))
-    assert evaluate.training_hours(run, np.array([50, 100, 150, 200, 300])).tolist() == [0.25, 0.5, 1, 1.5, 2]
+    assert run.hours(np.array([50, 100, 150, 200, 300])).tolist() == [0.25, 0.5, 1, 1.5, 2]
 
 
 def test_a_resumed_run_counts_its_seconds_once(caplog):
@@ -350,12 +350,12 @@ def test_a_resumed_run_counts_its_seconds_once(caplog):
     first.rename("a/events.out.tfevents.0")  # the files are read in the order of their names
     write_events("a", 1, [(3, 1), (4, 1), (5, 1)], begin=200, purge_step=201, num_steps=128)
     run = evaluate.read_run("a")
-    steps, seconds = evaluate.read_seconds(run, "iteration")
-    assert (steps.tolist(), seconds.tolist()) == ([100, 200, 300, 400, 500], [2, 3, 4, 5, 6])
-    assert evaluate.training_hours(run, np.array([500]))[0] == pytest.approx(20 / 3600)
-    assert evaluate.read_curve(run, "charts/episodic_return")[0].tolist() == [100, 200, 300, 400, 500]
+    steps, _ = run.curves["charts/seconds_iteration"]
+    assert (steps.tolist(), run.seconds("iteration").tolist()) == ([100, 200, 300, 400, 500], [2, 3, 4, 5, 6])
+    assert run.hours(np.array([500]))[0] == pytest.approx(20 / 3600)
+    assert run.curves["charts/episodic_return"][0].tolist() == [100, 200, 300, 400, 500]
     assert evaluate.wall_time([run])["hours"] == pytest.approx(20 / 3600)
-    assert evaluate.hyperparameters(run)["num_steps"] == "128", "those that it was resumed with"
+    assert run.args["num_steps"] == "128", "those that it was resumed with"
     assert not caplog.records, "TensorBoard calls it a crash"
 
 

@@ -1,5 +1,6 @@
 """benchmarks/learning.py: its command lines, and which runs it need not train again."""
 
+import shutil
 import signal
 from pathlib import Path
 
@@ -28,7 +29,7 @@ def test_an_agent_may_have_further_flags(tmp_path):
     assert args.trxl_memory_gradient
     assert (args.trxl_num_layers, args.trxl_positional_encoding) == (3, "learned")  # the task's own flags come first
     assert args.exp_name == "TrXL-gradient-trxl-num-layers-3-trxl-positional-encoding-learned"
-    with pytest.raises(SystemExit, match="there is no TrXXL; there are no memory, stack of 4, GRU"):
+    with pytest.raises(SystemExit, match=r"there is no TrXXL; there are no memory, stack of 4, .*GRU"):
         learning.main(learning.Config(agents=("GRU", "TrXXL --trxl-num-layers 3"), folder=tmp_path))
 
 
@@ -36,21 +37,66 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     agent, task = "GRU, refreshed", learning.TASKS["mortar-mayhem"]
     small = "--num-envs 4 --num-steps 32 --num-minibatches 2 --hidden-size 8 --eval-levels 2 --eval-repeats 1"
     monkeypatch.setattr(learning, "COMMON", f"{learning.COMMON} {small}")
-    config = learning.Config(("mortar-mayhem",), (agent,), 3 * 128 / task.total_timesteps, (1,), evaluations=3)
-    config.folder, config.out = tmp_path / "learning", tmp_path / "curves"
+    config = learning.Config(
+        tasks=("mortar-mayhem",),
+        agents=(agent,),
+        steps_scale=3 * 128 / task.total_timesteps,
+        seeds=(1,),
+        evaluations=3,
+        folder=tmp_path / "learning",
+        results=tmp_path / "results",
+        out=tmp_path / "curves",
+    )
     config.folder.mkdir()
     monkeypatch.chdir(config.folder)
     args = ppo_gru.parse_args(learning.command(config, task, agent, 1)[2:])
     run = ppo_gru.setup(args)
     run.received_signal = signal.SIGTERM  # during the first of three iterations
     ppo_gru.run_to_end(args, run)
-    assert [*learning.folders_of(config, task, agent, 1).values()] == [False]
+
+    def trainings():
+        return learning.runs_in(str(config.folder / "runs"), config, task, agent, 1)
+
+    assert [learning.is_whole(each) for each in trainings()] == [False]
+    assert learning.result_of(config, task, agent, 1) is None
 
     learning.main(config)
     assert f"trained {agent} on {task.env_id}, seed 1" in capsys.readouterr().out
-    assert learning.folders_of(config, task, agent, 1) == {str(config.folder / run.folder): True}
-    learning.main(config)
+    (whole,) = trainings()
+    assert (learning.is_whole(whole), whole.path) == (True, str(config.folder / run.folder))
+    kept = learning.result_of(config, task, agent, 1)
+    assert kept.args == whole.args
+    for name in ("eval/commands_completed", "eval/return", "eval/length", "charts/seconds_iteration"):
+        for one, other in zip(kept.curves[name], whole.curves[name], strict=True):
+            assert one == pytest.approx(other, abs=1e-4)
+    assert kept.curves["eval/return"][1].shape == (3, 2, 1)
+
+    shutil.rmtree(config.folder)
+    learning.main(config)  # its result is enough
     told = capsys.readouterr().out
     assert "trained" not in told
     assert f"| {agent} | 1 |" in told
     assert config.out.with_suffix(".png").stat().st_size > 10_000
+
+
+def test_a_failed_run_stops_no_other(tmp_path, monkeypatch):
+    done = []
+
+    def train(config, task, agent, seed):
+        done.append(seed)
+        if seed == 1:
+            raise SystemExit("seed 1 failed: see its.log")
+
+    monkeypatch.setattr(learning, "train", train)
+    config = learning.Config(tasks=("mortar-mayhem",), agents=("GRU",), seeds=(1, 2), jobs=1, folder=tmp_path)
+    with pytest.raises(SystemExit, match=r"seed 1 failed: see its\.log; GRU on .*, seed 2, was stopped; the same"):
+        learning.main(config)
+    assert done == [1, 2]
+
+
+def test_the_full_suite():
+    """The ten environments with their default options, and the agents of figures 6.1 to 6.3."""
+    tasks, agents = learning.SUITES["full"]
+    assert len(tasks) == 10
+    assert [(name, task.env_id, task.options) for name, task in tasks.items()] == [(i, i, {}) for i in tasks]
+    assert len(agents) == len(set(agents)) == 9

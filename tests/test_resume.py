@@ -144,9 +144,9 @@ def test_what_was_played_twice_is_logged_once(tiny, curves, monkeypatch, script)
     assert curves(run.folder)["losses/loss"] == whole["losses/loss"][:3]
     assert resumed(script, run.folder) == run.folder
     assert curves(run.folder) == whole
-    steps, scores = evaluate.read_curve(evaluate.read_run(str(run.folder)), "eval/return")
+    steps, scores = evaluate.read_run(str(run.folder)).curves["eval/return"]
     assert steps.tolist() == [64, 128, 192, 256, 320, 384]
-    assert scores.shape == (6, 2), "each level's"
+    assert scores.shape == (6, 2, 1), "each level's"
     found = sorted(int(path.stem.partition("-")[2]) for path in run.folder.glob("model-*.pt"))
     assert found == [64, 128, 192, 256, 320, 384]
 
