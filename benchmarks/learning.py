@@ -111,7 +111,11 @@ SMALL = {
         },
     ),
 }
-FULL = {env_id: Task(env_id, 10_000_000) for env_id in memory_gym_envs.IDS}
+FULL = {
+    # As in the small task, an agent has to tell tiles apart to remember them.
+    env_id: Task(env_id, 10_000_000, flags="--vector-frequencies 4" if "MysteryPath" in env_id else "")
+    for env_id in memory_gym_envs.IDS
+}
 TASKS = SMALL | FULL
 SUITES = {
     "small": (SMALL, ("no memory", "stack of 4", "GRU", "TrXL")),
