@@ -21,6 +21,7 @@ import gzip
 import itertools
 import json
 import logging
+import math
 import os
 import sys
 import textwrap
@@ -430,17 +431,22 @@ def read_runs(config: Config) -> dict[str, Run]:
 
 
 def draw_curves(config: Config) -> list[dict[str, Any]]:
-    """Draw a row of pictures for each task, a column for each metric; print where the curves end, and return it.
+    """Draw a picture of each task and metric, the metrics side by side; print where the curves end, and return it.
 
     Wall times are printed and returned of the agents whose runs all have them.
     """
     every = read_runs(config)
     tasks = tasks_of({path: run.args for path, run in every.items()}, task_of)
-    columns = len(config.metrics) or 1
+    metrics = len(config.metrics) or 1
+    across = min(len(tasks), 2) if metrics == 1 else 1  # tasks side by side
+    down = math.ceil(len(tasks) / across)
     legend = 0.22 * max(map(len, tasks.values()))  # inches below the curves
-    figure = Figure(figsize=(5.5 * columns, (3.8 + legend) * len(tasks)), layout="constrained")
+    figure = Figure(figsize=(5.5 * across * metrics, (3.8 + legend) * down), layout="constrained")
+    grid = figure.subplots(down, across * metrics, squeeze=False).reshape(-1, metrics)  # a task's pictures a row
+    for axis in grid[len(tasks) :].flat:
+        axis.remove()
     report = []
-    for axes, (title, agents) in zip(figure.subplots(len(tasks), columns, squeeze=False), tasks.items(), strict=True):
+    for axes, (title, agents) in zip(grid, tasks.items(), strict=False):
         runs = {label: [every[path] for path in paths] for label, paths in agents.items()}
         last = defaultdict(dict)
         env_id = next(run.args["env_id"] for members in runs.values() for run in members)
@@ -448,7 +454,7 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
             name = curve_name(metric, list(itertools.chain(*runs.values())))
             for label, scores in draw_metric(axis, name, runs, config.over).items():
                 last[label][name] = scores
-        axes[0].set_title(textwrap.fill(title, 55 * columns), loc="left", fontsize="medium")
+        axes[0].set_title(textwrap.fill(title, 55 * metrics), loc="left", fontsize="medium")
         axes[0].legend(loc="upper left", bbox_to_anchor=(0, -0.17), frameon=False)  # below, clear of the curves
         summaries = [summary(label, agents[label], last[label]) for label in agents]
         for each in summaries:

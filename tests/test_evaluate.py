@@ -415,6 +415,18 @@ def test_wall_times_are_left_out_where_runs_have_none(capsys):
     assert "| gamma=0.5 | 1 | 2.000 |" in capsys.readouterr().out.split("hours of a training")[1]
 
 
+def test_three_tasks_are_drawn_two_by_two():
+    runs = tuple(
+        write_events(f"run-{env_id}", 1, [(1, 1), (1, 1)], env_id=env_id) for env_id in ("A-v0", "B-v0", "C-v0")
+    )
+    report = evaluate.draw_curves(evaluate.Config(curves=runs))
+    assert [task["task"] for task in report] == ["A-v0", "B-v0", "C-v0"]
+    width, height = Image.open("curves.png").size
+    assert 1.3 < width / height < 1.5  # four pictures of 5.5 by 4 inches
+    titles = [element for element in Path("curves.svg").read_text().split("<!-- ") if element[1:6] == "-v0 -"]
+    assert len(titles) == 3
+
+
 # ---- scores ----
 def test_scores_are_those_of_the_levels(agents, capsys):
     models = tuple(f"{folder}/model.pt" for folder in agents)
