@@ -317,12 +317,16 @@ def with_defaults(given: dict[str, str]) -> dict[str, str]:
 
 
 def write_run(run: Run, path: str) -> None:
-    """Write a run's arguments, its evaluations in the family's own metric, return and length, and its seconds.
+    """Write what tables and pictures need, in a few KB; `read_run` reads it as it reads the run's folder.
 
-    That is what tables and pictures need, in a few KB: `read_run` reads it as it reads the run's folder.
+    That is the arguments, the evaluations in the family's own metric, return, length and falls, the seconds of each
+    iteration, and the norm of the gradient, averaged to POINTS.
     """
-    names = [f"eval/{name}" for name in (own_metric(run.args["env_id"]), "return", "length")] + [*SECONDS.values()]
-    kept = {name: run.curves[name] for name in dict.fromkeys(names) if name in run.curves}
+    names = [f"eval/{name}" for name in (own_metric(run.args["env_id"]), "return", "length", "num_fails")]
+    kept = {name: run.curves[name] for name in (*dict.fromkeys(names), *SECONDS.values()) if name in run.curves}
+    if "losses/grad_norm" in run.curves:
+        steps, norms = align([run.curves["losses/grad_norm"]])  # (P,), (P, R, M, E) with R = M = E = 1
+        kept["losses/grad_norm"] = steps, norms[:, 0]
     curves = {name: (steps.tolist(), values.round(4).tolist()) for name, (steps, values) in kept.items()}
     with gzip.open(path, "wt") as file:
         json.dump({"args": run.args, "curves": curves}, file, separators=(",", ":"))

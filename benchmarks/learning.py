@@ -127,16 +127,9 @@ SUITES = {
 
 
 @dataclass
-class Config:
-    """What to train and to draw."""
+class Training:
+    """How agents are trained, and where that goes."""
 
-    suite: Literal["small", "full"] = "small"
-    """tasks that are learned within minutes, or the ten environments with their default options"""
-    tasks: tuple[str, ...] = ()
-    """other tasks than the suite's, of those that this program knows"""
-    agents: tuple[str, ...] = ()
-    """other agents than the suite's, of those that this program knows, each alone or with further flags, e.g.
-    "TrXL --trxl-num-layers 3" """
     steps_scale: float = 1.0
     """share of a task's steps to train for"""
     seeds: tuple[int, ...] = (1, 2, 3)
@@ -149,11 +142,24 @@ class Config:
     """where the runs go"""
     results: Path = Path("learning/results")
     """where a file of some KB goes for every run that came to its end"""
+
+
+@dataclass
+class Config(Training):
+    """What to train and to draw."""
+
+    suite: Literal["small", "full"] = "small"
+    """tasks that are learned within minutes, or the ten environments with their default options"""
+    tasks: tuple[str, ...] = ()
+    """other tasks than the suite's, of those that this program knows"""
+    agents: tuple[str, ...] = ()
+    """other agents than the suite's, of those that this program knows, each alone or with further flags, e.g.
+    "TrXL --trxl-num-layers 3" """
     out: Path = Path("learning/curves")
     """draw the curves to OUT.png and OUT.svg"""
 
 
-def steps_of(config: Config, task: Task) -> int:
+def steps_of(config: Training, task: Task) -> int:
     """Return the steps that a run trains for."""
     return int(task.total_timesteps * config.steps_scale)
 
@@ -163,7 +169,7 @@ def file_name(agent: str) -> str:
     return re.sub(r"\W+", "-", agent)
 
 
-def command(config: Config, task: Task, agent: str, seed: int) -> list[str]:
+def command(config: Training, task: Task, agent: str, seed: int) -> list[str]:
     """Return the command line of a training run."""
     name, dashes, further = agent.partition(" --")
     script, *memory = AGENTS[name].split()
@@ -183,7 +189,7 @@ def parsed(script: str, flags: list[str]) -> Any:
     return importlib.import_module(Path(script).stem).parse_args(flags)
 
 
-def runs_in(place: str, config: Config, task: Task, agent: str, seed: int) -> list[evaluate.Run]:
+def runs_in(place: str, config: Training, task: Task, agent: str, seed: int) -> list[evaluate.Run]:
     """Return the runs with these arguments among the folders, or the files of results, in a place."""
     wanted, found = arguments(command(config, task, agent, seed)), []
     for path in sorted(glob.glob(f"{place}/{task.env_id}__{file_name(agent)}__{seed}__*")):
@@ -192,7 +198,7 @@ def runs_in(place: str, config: Config, task: Task, agent: str, seed: int) -> li
     return [run for run in found if {**run.args, "resume": "None"} == wanted]
 
 
-def result_of(config: Config, task: Task, agent: str, seed: int) -> evaluate.Run | None:
+def result_of(config: Training, task: Task, agent: str, seed: int) -> evaluate.Run | None:
     """Return such a run that came to its end, if its result is there."""
     return next(iter(runs_in(str(config.results), config, task, agent, seed)), None)
 
@@ -209,7 +215,7 @@ def arguments(line: list[str]) -> dict[str, str]:
     return {"script": Path(line[1]).stem} | {name: " ".join(str(value).split()) for name, value in args.items()}
 
 
-def train(config: Config, task: Task, agent: str, seed: int) -> None:
+def train(config: Training, task: Task, agent: str, seed: int) -> None:
     """Run a training, or go on with one that was stopped; raise SystemExit that names its output's file if it fails."""
     line = command(config, task, agent, seed)
     for run in runs_in(f"{config.folder}/runs", config, task, agent, seed):
@@ -224,7 +230,7 @@ def train(config: Config, task: Task, agent: str, seed: int) -> None:
     tqdm.write(f"trained {agent} on {task.env_id}, seed {seed}")
 
 
-def write_result(config: Config, task: Task, agent: str, seed: int) -> None:
+def write_result(config: Training, task: Task, agent: str, seed: int) -> None:
     """Train if that has not been done, and write what the run reached; raise SystemExit if it is not at its end."""
     wanted = (f"{config.folder}/runs", config, task, agent, seed)
     if not any(map(is_whole, runs_in(*wanted))):
@@ -235,8 +241,16 @@ def write_result(config: Config, task: Task, agent: str, seed: int) -> None:
     evaluate.write_run(whole[0], f"{config.results}/{Path(whole[0].path).name}.json.gz")
 
 
-def train_all(config: Config, missing: list[tuple[Task, str, int]]) -> None:
-    """Do the trainings, some at a time, and show how long it takes; raise SystemExit at the end if some failed."""
+def train_missing(config: Training, wanted: list[tuple[Task, str, int]]) -> None:
+    """Do the trainings that have no result, some at a time, and show how long it takes.
+
+    Raises SystemExit, at the end, if some failed, and for steps that are no number of steps.
+    """
+    if config.steps_scale <= 0:
+        raise SystemExit(f"--steps-scale is {config.steps_scale}; it must be above 0")
+    for folder in (config.folder, config.results):
+        folder.mkdir(parents=True, exist_ok=True)
+    missing = [run for run in wanted if result_of(config, *run) is None]
     steps, failed = sum(steps_of(config, task) for task, _, _ in missing), []
     with ThreadPoolExecutor(config.jobs) as pool, tqdm(total=steps, unit=" steps", unit_scale=True) as bar:
         trainings = {pool.submit(write_result, config, *run): run[0] for run in missing}
@@ -283,18 +297,14 @@ def report(config: Config, task: Task, runs: dict[str, list[evaluate.Run]]) -> N
 
 def main(config: Config) -> None:
     """Train what is missing, then print the tables and draw the curves."""
-    if config.steps_scale <= 0:
-        raise SystemExit(f"--steps-scale is {config.steps_scale}; it must be above 0")
     tasks, agents = (
         given or usual for given, usual in zip((config.tasks, config.agents), SUITES[config.suite], strict=True)
     )
     for given, known in ((tasks, TASKS), ([agent.partition(" --")[0] for agent in agents], AGENTS)):
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"there is no {unknown[0]}; there are {', '.join(known)}")
-    for folder in (config.folder, config.results):
-        folder.mkdir(parents=True, exist_ok=True)
     wanted = [(TASKS[task], agent, seed) for task in tasks for seed in config.seeds for agent in agents]
-    train_all(config, [run for run in wanted if result_of(config, *run) is None])
+    train_missing(config, wanted)
     paths = []
     for task in map(TASKS.get, tasks):
         runs = {agent: [result_of(config, task, agent, seed) for seed in config.seeds] for agent in agents}
