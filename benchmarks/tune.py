@@ -60,7 +60,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import tyro
-from learning import TASKS, Task
+from learning import SMALL, TASKS, Task
 
 from evaluate import SCRIPTS
 from ppo_gru import as_flags, flag
@@ -144,7 +144,7 @@ class Config:
     """begin no trial after that"""
     jobs: int = 1
     """worker processes, one thread each"""
-    tasks: tuple[str, ...] = tuple(TASKS)
+    tasks: tuple[str, ...] = tuple(SMALL)
     """of those that benchmarks/learning.py knows"""
     steps_scale: float = 0.6
     """share of a task's steps that a trial trains for"""
@@ -338,7 +338,7 @@ def open_study(config: Config) -> optuna.Study:
     wanted = {
         "--steps-scale": config.steps_scale,
         "--seeds": config.seeds,
-        "--tasks": {name: asdict(TASKS[name]) for name in config.tasks},
+        "--tasks": {name: asdict(TASKS[name]) | {"metric": TASKS[name].metric} for name in config.tasks},
         "search space": {name: distribution_to_json(each) for name, each in space_of(config.script).items()},
     }
     wanted = json.loads(json.dumps(wanted))  # as it is read from the file

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -310,6 +311,13 @@ def test_scores_that_do_not_compare_are_not_mixed(quick, name, value):
     tune.open_study(quick)
     with pytest.raises(ValueError, match=f"another --{name.replace('_', '-')}; use another --folder"):
         tune.open_study(replace(quick, **{name: value}))
+
+
+@each_script
+def test_the_committed_search_can_be_gone_on_with(script, quick):
+    config = replace(quick, script=script.__name__)
+    shutil.copytree(Path(tune.__file__).parent / "tuning", config.folder)
+    assert len(tune.open_study(config).get_trials()) >= 8
 
 
 def test_report_without_a_complete_trial(quick):
