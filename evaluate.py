@@ -25,6 +25,7 @@ import math
 import os
 import sys
 import textwrap
+import zlib
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -230,8 +231,12 @@ def labels(agents: list[dict[str, Any]]) -> list[str]:
 
 
 # ---- CURVES ----
+class NoCurvesError(ValueError):
+    """A run that was stopped in its first iteration, or no run at all."""
+
+
 @dataclass
-class Run:
+class RunLog:
     """What a training run logged. A curve is steps (P,) and values (P, M, E), by the name of its TensorBoard scalar.
 
     Of evaluations it has every episode. Runs of earlier versions kept the levels' means (E = 1); of losses and training
@@ -256,16 +261,16 @@ class Run:
         return set(SECONDS.values()) <= set(self.curves)
 
 
-def read_run(path: str) -> Run:
-    """Read a run folder's TensorBoard files, or a file of `write_run`; raise ValueError if it holds no curves."""
+def read_run(path: str) -> RunLog:
+    """Read a run folder's TensorBoard files, or a file of `write_run`; raise NoCurvesError if it holds none."""
     if path.endswith(".json.gz"):
         try:
             with gzip.open(path, "rt") as file:
                 saved = json.load(file)
             curves = {name: (np.array(steps), np.array(values)) for name, (steps, values) in saved["curves"].items()}
-            return Run(path, with_defaults(saved["args"]), curves)
-        except (KeyError, TypeError, ValueError, EOFError, gzip.BadGzipFile):
-            raise ValueError(f"{path} holds no curves of a training run") from None
+            return RunLog(path, with_defaults(saved["args"]), curves)
+        except (KeyError, TypeError, AttributeError, ValueError, EOFError, zlib.error, gzip.BadGzipFile):
+            raise NoCurvesError(f"{path} holds no curves of a training run") from None
     if not os.path.isdir(path):
         raise ValueError(f"there is no run folder {path}")
     logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it warns of a crash where a run was resumed
@@ -273,8 +278,8 @@ def read_run(path: str) -> Run:
     events.Reload()
     tags = events.Tags()
     if not tags["scalars"] or "hyperparameters/text_summary" not in tags["tensors"]:
-        raise ValueError(f"{path} holds no curves of a training run")
-    return Run(path, hyperparameters(events), event_curves(events))
+        raise NoCurvesError(f"{path} holds no curves of a training run")
+    return RunLog(path, hyperparameters(events), event_curves(events))
 
 
 def event_curves(events: EventAccumulator) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -292,7 +297,18 @@ def event_curves(events: EventAccumulator) -> dict[str, tuple[np.ndarray, np.nda
             points[name.replace("eval_levels/", "eval/")] = {
                 step: scores.reshape(len(scores), -1) for step, scores in found.items()
             }
-    return {name: (np.array([*each]), np.array([*each.values()])) for name, each in points.items() if each}
+    return {name: (np.array([*each]), stack_scores([*each.values()])) for name, each in points.items() if each}
+
+
+def stack_scores(scores: list[np.ndarray]) -> np.ndarray:
+    """Stack scores, (..., M, E) each; where only some have every episode, the levels' means (..., M, 1) of all.
+
+    Where they have different levels too, which do not compare, the means over these, (..., 1, 1).
+    """
+    for axis in (-1, -2):
+        if len({each.shape for each in scores}) > 1:
+            scores = [each.mean(axis, keepdims=True) for each in scores]
+    return np.stack(scores)
 
 
 def hyperparameters(events: EventAccumulator) -> dict[str, str]:
@@ -316,7 +332,7 @@ def with_defaults(given: dict[str, str]) -> dict[str, str]:
     return {"script": name} | {key: given.get(key, str(value)) for key, value in defaults.items()}
 
 
-def write_run(run: Run, path: str) -> None:
+def write_run(run: RunLog, path: str) -> None:
     """Write what tables and pictures need, in a few KB; `read_run` reads it as it reads the run's folder.
 
     That is the arguments, the evaluations in the family's own metric, return, length and falls, the seconds of each
@@ -328,11 +344,12 @@ def write_run(run: Run, path: str) -> None:
         steps, norms = align([run.curves["losses/grad_norm"]])  # (P,), (P, R, M, E) with R = M = E = 1
         kept["losses/grad_norm"] = steps, norms[:, 0]
     curves = {name: (steps.tolist(), values.round(4).tolist()) for name, (steps, values) in kept.items()}
-    with gzip.open(path, "wt") as file:
+    with gzip.open(f"{path}.part", "wt") as file:
         json.dump({"args": run.args, "curves": curves}, file, separators=(",", ":"))
+    os.replace(f"{path}.part", path)  # a file that is there is complete
 
 
-def curve_name(metric: str, runs: list[Run]) -> str:
+def curve_name(metric: str, runs: list[RunLog]) -> str:
     """Return the curve that shows the metric in every one of the runs, of evaluations rather than training episodes.
 
     Raises ValueError if there is none.
@@ -348,26 +365,26 @@ def curve_name(metric: str, runs: list[Run]) -> str:
 def align(runs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Bring curves, x (P,) and values (P, M, E) of each run, to a common x (P,): return it and scores (P, R, M, E).
 
-    x is steps or hours. The common x is that of all runs, as far as every run reaches; between its own, a run's values
-    are interpolated. More than POINTS become so many by the mean of neighbours. Where runs have played different
-    numbers of episodes, each run's mean is what compares, and M and E are 1. Raises ValueError if the runs do not
-    overlap.
+    x is steps or hours. The common x is that of all runs, as far as every run reaches, at most POINTS. Between its own,
+    a run has its last evaluation's scores: a mixture of two would have another IQM than either. Numbers that are means
+    already (M = E = 1) are interpolated, and averaged over neighbours. Raises ValueError if the runs do not overlap.
     """
-    if len({values.shape[1:] for _, values in runs}) > 1:
-        runs = [(x, values.mean((1, 2), keepdims=True)) for x, values in runs]
     first, last = max(x[0] for x, _ in runs), min(x[-1] for x, _ in runs)
     if first > last:
         raise ValueError("the curves of an agent's seeds do not overlap; leave out the shortest run")
     common = np.unique(np.concatenate([x for x, _ in runs]))
     common = common[(first <= common) & (common <= last)]
-    curves = [np.apply_along_axis(lambda y, x=x: np.interp(common, x, y), 0, values) for x, values in runs]
-    values = np.stack(curves, axis=1)  # (all x, R, M, E)
     parts = np.array_split(np.arange(len(common)), min(len(common), POINTS))
-    scores = np.stack([values[part].mean(0) for part in parts])  # (P, R, M, E)
-    return np.array([common[part].mean() for part in parts]), scores
+    if all(values[0].size == 1 for _, values in runs):
+        curves = np.stack([np.interp(common, x, values[:, 0, 0]) for x, values in runs], axis=1)  # (all x, R)
+        scores = np.stack([curves[part].mean(0) for part in parts])[..., None, None]
+        return np.array([common[part].mean() for part in parts]), scores
+    common = common[[part[-1] for part in parts]]  # (P,)
+    latest = [values[np.searchsorted(x, common, side="right") - 1] for x, values in runs]  # of (P, M, E)
+    return common, np.moveaxis(stack_scores(latest), 0, 1)
 
 
-def draw_metric(axis: Axes, name: str, agents: dict[str, list[Run]], over: str = "steps") -> dict[str, np.ndarray]:
+def draw_metric(axis: Axes, name: str, agents: dict[str, list[RunLog]], over: str = "steps") -> dict[str, np.ndarray]:
     """Draw a curve of every agent, its runs by label, over steps or time; return each one's last scores (R, M, E)."""
     last = {}
     for (label, runs), color in zip(agents.items(), itertools.cycle(color_sequences["petroff10"]), strict=False):
@@ -389,7 +406,12 @@ def draw_metric(axis: Axes, name: str, agents: dict[str, list[Run]], over: str =
     return last
 
 
-def wall_time(runs: list[Run]) -> dict[str, float]:
+def lacks_episodes(run: RunLog, name: str) -> bool:
+    """Return whether a run has been evaluated several times on each level, but kept the levels' means only."""
+    return name.startswith("eval/") and run.args["eval_repeats"] != "1" and run.curves[name][1].shape[2] == 1
+
+
+def wall_time(runs: list[RunLog]) -> dict[str, float]:
     """Return an agent's wall time by name, for JSON, as in the thesis' tables 6.3 and 6.4.
 
     mean to max: seconds of one iteration, over all iterations of all runs. collect, update: means of its two parts.
@@ -422,7 +444,7 @@ def time_table(agents: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def read_runs(config: Config) -> dict[str, Run]:
+def read_runs(config: Config) -> dict[str, RunLog]:
     """Read the runs; raise ValueError for one that cannot be drawn."""
     runs = {path: read_run(path) for path in dict.fromkeys(config.curves)}
     older = [path for path, run in runs.items() if not run.has_seconds()]
@@ -439,8 +461,8 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
 
     Wall times are printed and returned of the agents whose runs all have them.
     """
-    every = read_runs(config)
-    tasks = tasks_of({path: run.args for path, run in every.items()}, task_of)
+    runs_by_path = read_runs(config)
+    tasks = tasks_of({path: run.args for path, run in runs_by_path.items()}, task_of)
     metrics = len(config.metrics) or 1
     across = min(len(tasks), 2) if metrics == 1 else 1  # tasks side by side
     down = math.ceil(len(tasks) / across)
@@ -451,7 +473,7 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
         axis.remove()
     report = []
     for axes, (title, agents) in zip(grid, tasks.items(), strict=False):
-        runs = {label: [every[path] for path in paths] for label, paths in agents.items()}
+        runs = {label: [runs_by_path[path] for path in paths] for label, paths in agents.items()}
         last = defaultdict(dict)
         env_id = next(run.args["env_id"] for members in runs.values() for run in members)
         for axis, metric in zip(axes, config.metrics or [own_metric(env_id)], strict=True):
@@ -466,6 +488,10 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
                 each["wall_time"] = wall_time(runs[each["agent"]])
         report.append({"task": title, "agents": summaries})
         print(f"{title}, where the curves end\n\n{table(summaries)}\n")
+        if any(lacks_episodes(run, name) for members in runs.values() for run in members for name in last[label]):
+            print(
+                "an earlier version kept the levels' means only: the IQM of the runs that it trained is that of these\n"
+            )
         if any("wall_time" in each for each in summaries):
             print(f"{title}, seconds of an iteration and hours of a training\n\n{time_table(summaries)}\n")
     figure.draw_without_rendering()  # the layout changes the ticks, and these the layout

@@ -5,7 +5,7 @@
     python benchmarks/learning.py --suite full --results benchmarks/results
 
 The small suite has tasks that take minutes on a core; the full one has the ten environments as they are. Agents have
-vector observations and small networks, and all see the same vectors, a stack the last ones. Scores are those of
+vector observations and small networks, and all see the same vectors, a frame stack the last few. Scores are those of
 evaluations during training, on levels outside the training set (6.1.3).
 
 What a run reached is kept in a file of some KB in --results, which `evaluate.py --curves` can draw too. A run whose
@@ -19,8 +19,10 @@ import json
 import math
 import os
 import re
+import signal
 import subprocess
 import sys
+import zlib
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -54,6 +56,9 @@ AGENTS = {
         for name in ("TrXL", "GTrXL")
     },
 }
+
+
+RUNNING = set()  # training processes
 
 
 @dataclass(frozen=True)
@@ -175,10 +180,10 @@ def command(config: Training, task: Task, agent: str, seed: int) -> list[str]:
     script, *memory = AGENTS[name].split()
     steps = steps_of(config, task)
     flags = [*COMMON.split(), *memory, *task.flags.split(), *(task.trxl_flags.split() if "trxl" in script else [])]
-    flags += f"{dashes}{further}".split()
     flags += ["--total-timesteps", str(steps), "--anneal-steps", str(steps)]
     flags += ["--env-id", task.env_id, "--env-options", json.dumps(task.options)]
     flags += ["--exp-name", file_name(agent), "--seed", str(seed)]
+    flags += f"{dashes}{further}".split()
     args = parsed(script, flags)
     every = max(1, steps // (args.num_envs * args.num_steps) // config.evaluations)
     return [sys.executable, str(ROOT / script), *flags, "--eval-interval", str(every)]
@@ -189,56 +194,73 @@ def parsed(script: str, flags: list[str]) -> Any:
     return importlib.import_module(Path(script).stem).parse_args(flags)
 
 
-def runs_in(place: str, config: Training, task: Task, agent: str, seed: int) -> list[evaluate.Run]:
+def runs_in(place: str, config: Training, task: Task, agent: str, seed: int) -> list[evaluate.RunLog]:
     """Return the runs with these arguments among the folders, or the files of results, in a place."""
     wanted, found = arguments(command(config, task, agent, seed)), []
     for path in sorted(glob.glob(f"{place}/{task.env_id}__{file_name(agent)}__{seed}__*")):
-        with contextlib.suppress(ValueError):  # one that was stopped in its first iteration
+        with contextlib.suppress(evaluate.NoCurvesError):
             found.append(evaluate.read_run(path))
     return [run for run in found if {**run.args, "resume": "None"} == wanted]
 
 
-def result_of(config: Training, task: Task, agent: str, seed: int) -> evaluate.Run | None:
+def result_of(config: Training, task: Task, agent: str, seed: int) -> evaluate.RunLog | None:
     """Return such a run that came to its end, if its result is there."""
     return next(iter(runs_in(str(config.results), config, task, agent, seed)), None)
 
 
-def is_whole(run: evaluate.Run) -> bool:
-    """Return whether a run came to its end: it was evaluated then."""
+def is_whole(run: evaluate.RunLog) -> bool:
+    """Return whether a run has trained for all its steps."""
     total, *batch = (int(run.args[name]) for name in ("total_timesteps", "num_envs", "num_steps"))
-    return "eval/return" in run.curves and run.curves["eval/return"][0][-1] + math.prod(batch) > total
+    return run.curves["charts/seconds_iteration"][0][-1] + math.prod(batch) > total
 
 
 def arguments(line: list[str]) -> dict[str, str]:
-    """Return a command line's arguments as `evaluate.hyperparameters` tells those of a run."""
+    """Return a command line's arguments as a run that was read has them."""
     args = asdict(parsed(line[1], line[2:]))
     return {"script": Path(line[1]).stem} | {name: " ".join(str(value).split()) for name, value in args.items()}
 
 
 def train(config: Training, task: Task, agent: str, seed: int) -> None:
-    """Run a training, or go on with one that was stopped; raise SystemExit that names its output's file if it fails."""
+    """Run a training, or go on with one that was stopped; raise SystemExit that names its log if it fails."""
     line = command(config, task, agent, seed)
     for run in runs_in(f"{config.folder}/runs", config, task, agent, seed):
         if glob.glob(f"{run.path}/checkpoint-*.pt"):
             line = [*line[:2], "--resume", os.path.relpath(run.path, config.folder)]
     threads = str(max(1, (os.cpu_count() or 1) // config.jobs))
-    log = config.folder / f"{task.env_id}-{file_name(agent)}-{seed}.log"
+    tasks_hash = zlib.crc32(json.dumps(asdict(task)).encode())
+    log = config.folder / f"{task.env_id}-{file_name(agent)}-{seed}-{tasks_hash:08x}.log"
     environment = {**os.environ, "OMP_NUM_THREADS": threads, "TQDM_MININTERVAL": "10"}
     with log.open("a") as output:
-        if subprocess.run(line, cwd=config.folder, env=environment, stdout=output, stderr=output).returncode:
-            raise SystemExit(f"{agent} on {task.env_id}, seed {seed}, failed: see {log}")
-    tqdm.write(f"trained {agent} on {task.env_id}, seed {seed}")
+        # In a session of its own, Ctrl-C does not reach it: `train_missing` stops it, so that it leaves a checkpoint.
+        how = {"cwd": config.folder, "env": environment, "stdout": output, "stderr": output, "start_new_session": True}
+        with subprocess.Popen(line, **how) as process:
+            RUNNING.add(process)
+            code = process.wait()
+            RUNNING.remove(process)
+    if code == 0:
+        tqdm.write(f"trained {agent} on {task.env_id}, seed {seed}")
+    elif code not in (-signal.SIGTERM, 128 + signal.SIGTERM):  # stopped before its first iteration, or after one
+        raise SystemExit(f"{agent} on {task.env_id}, seed {seed}, failed: see {log}")
 
 
 def write_result(config: Training, task: Task, agent: str, seed: int) -> None:
-    """Train if that has not been done, and write what the run reached; raise SystemExit if it is not at its end."""
+    """Train if that has not been done, and write what the run reached.
+
+    Raises SystemExit if it is not at its end, or has not been scored there.
+    """
     wanted = (f"{config.folder}/runs", config, task, agent, seed)
     if not any(map(is_whole, runs_in(*wanted))):
         train(config, task, agent, seed)
-    whole = [run for run in runs_in(*wanted) if is_whole(run)]
-    if not whole:
+    run = next(filter(is_whole, runs_in(*wanted)), None)
+    if run is None:
         raise SystemExit(f"{agent} on {task.env_id}, seed {seed}, was stopped; the same command goes on with it")
-    evaluate.write_run(whole[0], f"{config.results}/{Path(whole[0].path).name}.json.gz")
+    steps, _ = run.curves.get(f"eval/{task.metric}", ([0], None))
+    if steps[-1] != run.curves["charts/seconds_iteration"][0][-1]:
+        raise SystemExit(
+            f"{agent} on {task.env_id}, seed {seed}, has no {task.metric} at its end: an evaluation was cut short; "
+            f'give the agent more steps, as "{agent} --eval-max-steps 100000"'
+        )
+    evaluate.write_run(run, f"{config.results}/{Path(run.path).name}.json.gz")
 
 
 def train_missing(config: Training, wanted: list[tuple[Task, str, int]]) -> None:
@@ -250,44 +272,45 @@ def train_missing(config: Training, wanted: list[tuple[Task, str, int]]) -> None
         raise SystemExit(f"--steps-scale is {config.steps_scale}; it must be above 0")
     for folder in (config.folder, config.results):
         folder.mkdir(parents=True, exist_ok=True)
-    missing = [run for run in wanted if result_of(config, *run) is None]
+    each_once = {tuple(command(config, *run)): run for run in wanted}.values()
+    missing = [run for run in each_once if result_of(config, *run) is None]
     steps, failed = sum(steps_of(config, task) for task, _, _ in missing), []
     with ThreadPoolExecutor(config.jobs) as pool, tqdm(total=steps, unit=" steps", unit_scale=True) as bar:
         trainings = {pool.submit(write_result, config, *run): run[0] for run in missing}
         try:
             for training in as_completed(trainings):
-                if (error := training.exception()) is not None:
+                try:
+                    training.result()
+                except SystemExit as error:
                     failed.append(str(error))
                     tqdm.write(failed[-1])
                 bar.update(steps_of(config, trainings[training]))
         except KeyboardInterrupt:
-            pool.shutdown(cancel_futures=True)
-            raise
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in RUNNING.copy():
+                process.terminate()
+            raise SystemExit("stopped; the same command goes on") from None
     if failed:
         raise SystemExit("; ".join(failed))
 
 
-def row(agent: str, runs: list[evaluate.Run], metric: str, best: float) -> str:
+def row(agent: str, runs: list[evaluate.RunLog], metric: str, best: float) -> str:
     """Return the agent's row: its last score, and what it took to nine tenths of the best score of all agents."""
-    curves = [run.curves[f"eval/{metric}"] for run in runs]
-    steps, scores = map(np.stack, zip(*curves, strict=True))  # (R, P), (R, P, M, E)
-    hours = np.stack([run.hours(each) for run, each in zip(runs, steps, strict=True)])  # (R, P), without evaluations
-    last, ends = evaluate.iqm(scores[:, -1]), evaluate.interval(scores[:, -1])
-    middle = evaluate.iqm(scores.swapaxes(0, 1))  # (P,)
-    reached = np.flatnonzero(middle >= 0.9 * best)
-    taken = ("never", "")
-    if reached.size:
-        taken = (f"{steps[0, reached[0]]:,.0f}", f"{60 * hours[:, reached[0]].mean():.1f}")
-    mean = scores[:, -1].mean()
+    steps, scores = evaluate.align([run.curves[f"eval/{metric}"] for run in runs])  # (P,), (P, R, M, E)
+    minutes = 60 * np.mean([run.hours(steps) for run in runs], 0)  # (P,), without evaluations
+    ends = evaluate.interval(scores[-1])
+    middle = evaluate.iqm(scores)  # (P,)
+    reached = np.flatnonzero(middle >= 0.9 * best) if best > 0 else np.array([])
+    taken = (f"{steps[reached[0]]:,.0f}", f"{minutes[reached[0]]:.1f}") if reached.size else ("never", "")
     span = "none: one seed" if ends is None else "{:.2f} to {:.2f}".format(*ends)
-    whole = f"{60 * hours[:, -1].mean():.1f}"
-    return f"| {agent} | {len(runs)} | {mean:.2f} | {last:.2f} | {span} | {taken[0]} | {taken[1]} | {whole} |"
+    cells = (agent, len(runs), f"{scores[-1].mean():.2f}", f"{middle[-1]:.2f}", span, *taken, f"{minutes[-1]:.1f}")
+    return f"| {' | '.join(map(str, cells))} |"
 
 
-def report(config: Config, task: Task, runs: dict[str, list[evaluate.Run]]) -> None:
+def report(config: Config, task: Task, runs: dict[str, list[evaluate.RunLog]]) -> None:
     """Print a task's table: each agent's runs, an evaluated seed each."""
-    curves = [[run.curves[f"eval/{task.metric}"][1] for run in each] for each in runs.values()]  # of (P, M, E)
-    best = max(evaluate.iqm(np.stack([curve[-1] for curve in each])) for each in curves)
+    curves = [evaluate.align([run.curves[f"eval/{task.metric}"] for run in each]) for each in runs.values()]
+    best = max(evaluate.iqm(scores[-1]) for _, scores in curves)
     print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {steps_of(config, task):,} steps\n")
     print("| agent | seeds | mean | IQM | 95 % interval | steps to 0.9 of the best | minutes | minutes in all |")
     print("|---|---:|---:|---:|---|---:|---:|---:|")
@@ -297,9 +320,8 @@ def report(config: Config, task: Task, runs: dict[str, list[evaluate.Run]]) -> N
 
 def main(config: Config) -> None:
     """Train what is missing, then print the tables and draw the curves."""
-    tasks, agents = (
-        given or usual for given, usual in zip((config.tasks, config.agents), SUITES[config.suite], strict=True)
-    )
+    suite_tasks, suite_agents = SUITES[config.suite]
+    tasks, agents = config.tasks or suite_tasks, config.agents or suite_agents
     for given, known in ((tasks, TASKS), ([agent.partition(" --")[0] for agent in agents], AGENTS)):
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"there is no {unknown[0]}; there are {', '.join(known)}")
@@ -314,4 +336,5 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     main(tyro.cli(Config))

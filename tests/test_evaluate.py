@@ -184,8 +184,23 @@ def test_curves_on_common_steps():
     )
     assert steps.tolist() == [5, 10, 15]
     assert scores.shape == (3, 2, 1, 2)
+    assert scores[..., 0, 0].tolist() == [[0, 4], [1, 4], [1, 8]]
+    assert scores[..., 0, 1].tolist() == [[5, 0], [5, 0], [5, 2]]
+
+
+def test_means_are_interpolated():
+    runs = [(np.array([0, 10, 20]), np.array([0.0, 1.0, 3.0])), (np.array([5, 15]), np.array([4.0, 8.0]))]
+    steps, scores = evaluate.align([(x, values[:, None, None]) for x, values in runs])
+    assert steps.tolist() == [5, 10, 15]
     assert scores[..., 0, 0].tolist() == [[0.5, 4], [1, 6], [2, 8]]
-    assert scores[..., 0, 1].tolist() == [[5, 0], [5, 1], [5, 2]]
+
+
+def test_dense_evaluations_are_left_out():
+    steps = np.arange(1, 10 * evaluate.POINTS + 1)
+    won = np.random.default_rng(1).integers(2, size=(len(steps), 2, 3))
+    common, scores = evaluate.align([(steps, won)])
+    assert np.array_equal(common, np.arange(10, 10 * evaluate.POINTS + 1, 10))
+    assert np.array_equal(scores[:, 0], won[9::10])
 
 
 @pytest.mark.parametrize("shape", [(2, 1, 2), (2, 2, 1)])
@@ -289,15 +304,29 @@ def test_the_arguments_of_an_older_run():
 
 
 def test_the_levels_of_an_older_run():
-    """It kept each level's mean."""
+    """It kept each level's mean. Where a newer version has gone on with it, both are brought to these."""
     with SummaryWriter("old") as writer:
         writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|3|")
         writer.add_scalar("eval/return", 2.0, 10)
+        writer.add_scalar("eval/return", 2.5, 20)
         writer.add_tensor("eval_levels/return", torch.tensor([1.0, 3.0]), 10)
-    assert [each.tolist() for each in evaluate.read_run("old").curves["eval/return"]] == [
-        [10],
-        [[[1], [3]]],
-    ]
+        writer.add_tensor("eval_levels/return", torch.tensor([[1.0, 2.0], [3.0, 4.0]]), 20)
+    steps, scores = evaluate.read_run("old").curves["eval/return"]
+    assert (steps.tolist(), scores.tolist()) == ([10, 20], [[[1], [3]], [[1.5], [3.5]]])
+
+
+def test_a_table_says_whose_episodes_were_not_kept(capsys):
+    for seed, scores in ((1, [1.0, 3.0]), (2, [[1.0, 2.0], [3.0, 4.0]])):
+        with SummaryWriter(f"run-{seed}") as writer:
+            rows = f"|seed|{seed}|\n|env_id|A-v0|\n|eval_repeats|2|"
+            writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
+            writer.add_scalar("eval/return", np.mean(scores), 10)
+            writer.add_tensor("eval_levels/return", torch.tensor(scores), 10)
+    evaluate.draw_curves(evaluate.Config(curves=("run-2",)))
+    assert "an earlier version kept" not in capsys.readouterr().out
+    (task,) = evaluate.draw_curves(evaluate.Config(curves=("run-1", "run-2")))
+    assert task["agents"][0]["metrics"]["eval/return"]["scores"] == [[[1], [3]], [[1.5], [3.5]]]
+    assert "an earlier version kept the levels' means only" in capsys.readouterr().out
 
 
 def test_the_arguments_of_a_run_of_another_script():
