@@ -211,7 +211,7 @@ def result_of(config: Training, task: Task, agent: str, seed: int) -> evaluate.R
 def is_whole(run: evaluate.RunLog) -> bool:
     """Return whether a run has trained for all its steps."""
     total, *batch = (int(run.args[name]) for name in ("total_timesteps", "num_envs", "num_steps"))
-    return run.curves["charts/seconds_iteration"][0][-1] + math.prod(batch) > total
+    return run.has_seconds() and run.curves["charts/seconds_iteration"][0][-1] + math.prod(batch) > total
 
 
 def arguments(line: list[str]) -> dict[str, str]:
@@ -227,8 +227,8 @@ def train(config: Training, task: Task, agent: str, seed: int) -> None:
         if glob.glob(f"{run.path}/checkpoint-*.pt"):
             line = [*line[:2], "--resume", os.path.relpath(run.path, config.folder)]
     threads = str(max(1, (os.cpu_count() or 1) // config.jobs))
-    tasks_hash = zlib.crc32(json.dumps(asdict(task)).encode())
-    log = config.folder / f"{task.env_id}-{file_name(agent)}-{seed}-{tasks_hash:08x}.log"
+    task_hash = zlib.crc32(json.dumps(asdict(task)).encode())
+    log = config.folder / f"{task.env_id}-{file_name(agent)}-{seed}-{task_hash:08x}.log"
     environment = {**os.environ, "OMP_NUM_THREADS": threads, "TQDM_MININTERVAL": "10"}
     with log.open("a") as output:
         # In a session of its own, Ctrl-C does not reach it: `train_missing` stops it, so that it leaves a checkpoint.

@@ -1,7 +1,11 @@
 """benchmarks/learning.py: its command lines, and which runs it need not train again."""
 
+import fcntl
 import shutil
 import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import learning
@@ -92,6 +96,24 @@ def test_a_failed_run_stops_no_other(tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match=r"seed 1 failed: see its\.log; GRU on .*, seed 2, was stopped; the same"):
         learning.main(config)
     assert done == [1, 2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_program_stops_its_trainings_with_a_checkpoint(number, tmp_path):
+    line = [sys.executable, learning.__file__, "--tasks", "mortar-mayhem", "--agents", "GRU", "--jobs", "1"]
+    with subprocess.Popen([*line, "--folder", "."], cwd=tmp_path, stderr=subprocess.PIPE, text=True) as program:
+        deadline = time.monotonic() + 120
+        while not any("SPS" in log.read_text() for log in tmp_path.glob("*.log")):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        program.send_signal(number)
+        assert program.stderr.read().endswith("stopped; the same command goes on\n")
+    assert program.returncode == 1
+    (folder,) = tmp_path.glob("runs/*")
+    assert len([*folder.glob("checkpoint-*.pt")]) == 1
+    with (folder / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # nothing trains any more
 
 
 def test_the_full_suite():
