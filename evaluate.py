@@ -267,7 +267,7 @@ def read_run(path: str) -> RunLog:
         try:
             with gzip.open(path, "rt") as file:
                 saved = json.load(file)
-            curves = {name: (np.array(steps), np.array(values)) for name, (steps, values) in saved["curves"].items()}
+            curves = {name: (np.cumsum(steps), np.array(values)) for name, (steps, values) in saved["curves"].items()}
             return RunLog(path, with_defaults(saved["args"]), curves)
         except (KeyError, TypeError, AttributeError, ValueError, EOFError, zlib.error, gzip.BadGzipFile):
             raise NoCurvesError(f"{path} holds no curves of a training run") from None
@@ -336,14 +336,18 @@ def write_run(run: RunLog, path: str) -> None:
     """Write what tables and pictures need, in a few KB; `read_run` reads it as it reads the run's folder.
 
     That is the arguments, the evaluations in the family's own metric, return, length and falls, the seconds of each
-    iteration, and the norm of the gradient, averaged to POINTS.
+    iteration, and the norm of the gradient, averaged to POINTS. Steps are kept as differences, which compress better.
     """
     names = [f"eval/{name}" for name in (own_metric(run.args["env_id"]), "return", "length", "num_fails")]
     kept = {name: run.curves[name] for name in (*dict.fromkeys(names), *SECONDS.values()) if name in run.curves}
     if "losses/grad_norm" in run.curves:
         steps, norms = align([run.curves["losses/grad_norm"]])  # (P,), (P, R, M, E) with R = M = E = 1
         kept["losses/grad_norm"] = steps, norms[:, 0]
-    curves = {name: (steps.tolist(), values.round(4).tolist()) for name, (steps, values) in kept.items()}
+    four_digits = np.vectorize(lambda value: float(f"{value:.4g}"))  # also of small norms; scores have few digits
+    curves = {
+        name: (np.diff(steps, prepend=0).tolist(), (values if "eval/" in name else four_digits(values)).tolist())
+        for name, (steps, values) in kept.items()
+    }
     with gzip.open(f"{path}.part", "wt") as file:
         json.dump({"args": run.args, "curves": curves}, file, separators=(",", ":"))
     os.replace(f"{path}.part", path)  # a file that is there is complete

@@ -275,7 +275,10 @@ def train_missing(config: Training, wanted: list[tuple[Task, str, int]]) -> None
     each_once = {tuple(command(config, *run)): run for run in wanted}.values()
     missing = [run for run in each_once if result_of(config, *run) is None]
     steps, failed = sum(steps_of(config, task) for task, _, _ in missing), []
-    with ThreadPoolExecutor(config.jobs) as pool, tqdm(total=steps, unit=" steps", unit_scale=True) as bar:
+    with (
+        ThreadPoolExecutor(config.jobs) as pool,
+        tqdm(total=steps, unit=" steps", unit_scale=True, disable=not missing) as bar,
+    ):
         trainings = {pool.submit(write_result, config, *run): run[0] for run in missing}
         try:
             for training in as_completed(trainings):
