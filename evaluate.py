@@ -478,10 +478,12 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
     report = []
     for axes, (title, agents) in zip(grid, tasks.items(), strict=False):
         runs = {label: [runs_by_path[path] for path in paths] for label, paths in agents.items()}
-        last = defaultdict(dict)
+        last, is_incomplete = defaultdict(dict), False
         env_id = next(run.args["env_id"] for members in runs.values() for run in members)
         for axis, metric in zip(axes, config.metrics or [own_metric(env_id)], strict=True):
-            name = curve_name(metric, list(itertools.chain(*runs.values())))
+            every_run = list(itertools.chain(*runs.values()))
+            name = curve_name(metric, every_run)
+            is_incomplete |= any(lacks_episodes(run, name) for run in every_run)
             for label, scores in draw_metric(axis, name, runs, config.over).items():
                 last[label][name] = scores
         axes[0].set_title(textwrap.fill(title, 55 * metrics), loc="left", fontsize="medium")
@@ -492,10 +494,8 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
                 each["wall_time"] = wall_time(runs[each["agent"]])
         report.append({"task": title, "agents": summaries})
         print(f"{title}, where the curves end\n\n{table(summaries)}\n")
-        if any(lacks_episodes(run, name) for members in runs.values() for run in members for name in last[label]):
-            print(
-                "an earlier version kept the levels' means only: the IQM of the runs that it trained is that of these\n"
-            )
+        if is_incomplete:
+            print("earlier versions kept the levels' means only: the IQM of runs that they trained is that of these\n")
         if any("wall_time" in each for each in summaries):
             print(f"{title}, seconds of an iteration and hours of a training\n\n{time_table(summaries)}\n")
     figure.draw_without_rendering()  # the layout changes the ticks, and these the layout

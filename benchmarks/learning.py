@@ -58,9 +58,6 @@ AGENTS = {
 }
 
 
-RUNNING = set()  # training processes
-
-
 @dataclass(frozen=True)
 class Task:
     """A task, and how it is learned."""
@@ -146,7 +143,7 @@ class Training:
     folder: Path = Path("learning")
     """where the runs go"""
     results: Path = Path("learning/results")
-    """where a file of some KB goes for every run that came to its end"""
+    """where a file of some KB goes for every finished run"""
 
 
 @dataclass
@@ -204,11 +201,11 @@ def runs_in(place: str, config: Training, task: Task, agent: str, seed: int) -> 
 
 
 def result_of(config: Training, task: Task, agent: str, seed: int) -> evaluate.RunLog | None:
-    """Return such a run that came to its end, if its result is there."""
+    """Return the finished run with these arguments, if its result is there."""
     return next(iter(runs_in(str(config.results), config, task, agent, seed)), None)
 
 
-def is_whole(run: evaluate.RunLog) -> bool:
+def is_complete(run: evaluate.RunLog) -> bool:
     """Return whether a run has trained for all its steps."""
     total, *batch = (int(run.args[name]) for name in ("total_timesteps", "num_envs", "num_steps"))
     return run.has_seconds() and run.curves["charts/seconds_iteration"][0][-1] + math.prod(batch) > total
@@ -218,6 +215,9 @@ def arguments(line: list[str]) -> dict[str, str]:
     """Return a command line's arguments as a run that was read has them."""
     args = asdict(parsed(line[1], line[2:]))
     return {"script": Path(line[1]).stem} | {name: " ".join(str(value).split()) for name, value in args.items()}
+
+
+RUNNING = set()  # training processes, to be stopped with this one
 
 
 def train(config: Training, task: Task, agent: str, seed: int) -> None:
@@ -246,12 +246,12 @@ def train(config: Training, task: Task, agent: str, seed: int) -> None:
 def write_result(config: Training, task: Task, agent: str, seed: int) -> None:
     """Train if that has not been done, and write what the run reached.
 
-    Raises SystemExit if it is not at its end, or has not been scored there.
+    Raises SystemExit if it was stopped, or has no score at its end.
     """
     wanted = (f"{config.folder}/runs", config, task, agent, seed)
-    if not any(map(is_whole, runs_in(*wanted))):
+    if not any(map(is_complete, runs_in(*wanted))):
         train(config, task, agent, seed)
-    run = next(filter(is_whole, runs_in(*wanted)), None)
+    run = next(filter(is_complete, runs_in(*wanted)), None)
     if run is None:
         raise SystemExit(f"{agent} on {task.env_id}, seed {seed}, was stopped; the same command goes on with it")
     steps, _ = run.curves.get(f"eval/{task.metric}", ([0], None))

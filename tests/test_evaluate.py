@@ -44,7 +44,7 @@ def test_interquartile_mean(scores, middle, shape):
 def test_interval_by_hand():
     """The IQM of four is the mean of the middle two: 0 if at least three are the worst seed's (5 %)."""
     assert evaluate.interval(np.array([[[0.0]], [[4.0]], [[8.0]], [[100.0]]])).tolist() == [0, 100]
-    # Two seeds, drawn whole: both the bad one (25 %), or both the good one (25 %). Drawn anew for each of the six
+    # Two seeds, drawn whole: both the bad one (25 %), or both the good one (25 %). Drawn separately for each of the six
     # levels, an IQM of 0 would need at least nine of twelve to be bad (7 %), one of 1 as many good ones.
     assert evaluate.interval(np.array([[[0.0]] * 6, [[1.0]] * 6])).tolist() == [0, 1]
 
@@ -323,10 +323,10 @@ def test_a_table_says_whose_episodes_were_not_kept(capsys):
             writer.add_scalar("eval/return", np.mean(scores), 10)
             writer.add_tensor("eval_levels/return", torch.tensor(scores), 10)
     evaluate.draw_curves(evaluate.Config(curves=("run-2",)))
-    assert "an earlier version kept" not in capsys.readouterr().out
+    assert "earlier versions kept" not in capsys.readouterr().out
     (task,) = evaluate.draw_curves(evaluate.Config(curves=("run-1", "run-2")))
     assert task["agents"][0]["metrics"]["eval/return"]["scores"] == [[[1], [3]], [[1.5], [3.5]]]
-    assert "an earlier version kept the levels' means only" in capsys.readouterr().out
+    assert "earlier versions kept the levels' means only" in capsys.readouterr().out
 
 
 def test_the_arguments_of_a_run_of_another_script():

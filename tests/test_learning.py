@@ -61,13 +61,13 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     def trainings():
         return learning.runs_in(str(config.folder / "runs"), config, task, agent, 1)
 
-    assert [learning.is_whole(each) for each in trainings()] == [False]
+    assert [learning.is_complete(each) for each in trainings()] == [False]
     assert learning.result_of(config, task, agent, 1) is None
 
     learning.main(config)
     assert f"trained {agent} on {task.env_id}, seed 1" in capsys.readouterr().out
     (whole,) = trainings()
-    assert (learning.is_whole(whole), whole.path) == (True, str(config.folder / run.folder))
+    assert (learning.is_complete(whole), whole.path) == (True, str(config.folder / run.folder))
     kept = learning.result_of(config, task, agent, 1)
     assert kept.args == whole.args
     for name in ("eval/commands_completed", "eval/return", "eval/length", "charts/seconds_iteration"):
@@ -122,7 +122,7 @@ def test_committed_results_are_those_of_today_s_commands(steps_scale):
     task = learning.TASKS["mortar-mayhem" if steps_scale == 1 else "endless-mortar-mayhem"]
     config = learning.Config(steps_scale=steps_scale, results=results)
     runs = [learning.result_of(config, task, "GRU", seed) for seed in (1, 2)]
-    assert all(map(learning.is_whole, runs))
+    assert all(map(learning.is_complete, runs))
     assert all(len(run.curves["eval/commands_completed"][0]) >= config.evaluations for run in runs)
 
 
