@@ -6,12 +6,16 @@ import cue_recall  # noqa: F401 (registers CueRecall-v0)
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.summary.writer import event_file_writer
 from tensorboard.util.tensor_util import make_ndarray
 
 import ppo_gru
 import ppo_trxl
 
 torch.set_num_threads(1)  # the networks here are so small that threads would mostly wait for each other
+# TensorBoard reads the files of a run in the order of their names: the second, then a process's count of its files,
+# where 10 comes before 9. Only tests open two files of a run within a second.
+event_file_writer._global_uid = event_file_writer.AtomicCounter(1000)
 
 
 @pytest.fixture(autouse=True)
