@@ -7,7 +7,7 @@ The rollout stores the hidden state that each step began with. For the update, t
 into sequences at the ends of episodes (and every --seq-len steps), padded with zeros to the longest sequence, and
 unrolled from the stored hidden state of their first step: truncated back-propagation through time. The gradient
 reaches back to the first step of the sequence. The hidden state that a sequence starts from was computed while acting,
-possibly with older weights, and is not recomputed.
+possibly with older weights; --refresh-memory recomputes it before each epoch but the first.
 
 Source: "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", called the thesis below.
 §5.2 is its section, (5.7) its equation; defaults are the "Final" column of its table 6.1.
@@ -17,8 +17,8 @@ the same with another one, but for its flags. What evaluates (7), what runs a tr
 line) and what only makes it faster (9) may be skipped.
 
 Shape letters: T steps of a rollout, N environments, A action branches, B samples of a minibatch, S sequences of a
-minibatch, L steps of the longest, D width of the memory, P hidden vectors per environment, F features, G entries of the
-ground truth, V entries of a vector.
+minibatch, L steps of the longest, I inputs and D width of the memory, P hidden vectors per environment, F features, G
+entries of the ground truth, V entries of a vector.
 """
 
 import argparse
@@ -96,7 +96,8 @@ class Args:
     exp_name: str = "ppo_gru"
     """name of the experiment, part of the run folder's name"""
     preset: Literal["thesis", "laptop"] = "thesis"
-    """a set of defaults, told above, that the command line begins with; flags that are given win over it"""
+    """a set of defaults, listed above, that the command line begins with; flags that are given win over it (in Python:
+    Args(**PRESETS["laptop"]))"""
     seed: NonNegativeInt = 1
     """seed of the weights, the actions and the environments: same seed, same curves (on the CPU to the last bit)"""
     torch_deterministic: bool = True
@@ -166,7 +167,7 @@ class Args:
     gae_lambda: UnitInterval = 0.95
     """lambda of generalized advantage estimation"""
     refresh_memory: bool = False
-    """before every epoch but the first, compute again what the rollout stored of memory, with the present weights"""
+    """before every epoch but the first, recompute the memory that the rollout stored, with the present weights"""
     bootstrap_truncated: bool = False
     """value the final observation of an episode that a time limit cut short, instead of counting it as ended"""
     norm_adv: Literal["none", "minibatch", "batch"] = "none"
@@ -542,11 +543,14 @@ class Decoder(nn.Sequential):
 
 
 # ---- 4 MEMORY ----
-# What the other sections use of a memory, whichever it is: Memory(args, inputs), an nn.Module from I inputs to width D,
-# and its MemoryState. While acting: initial_state, begin_rollout, step (which also stores what the update needs), reset
-# where an episode ended. For the update: cut the rollout into pieces, and unroll pieces; rewind to the rollout's first
-# step, to store all again. And logs, numbers for TensorBoard. A checkpoint holds the MemoryState, but for the fields in
-# `not_saved`.
+# Memory(args, inputs) is an nn.Module that maps I inputs to width D; a MemoryState is what it remembers. What the other
+# sections use of any memory:
+#   initial_state, begin_rollout   the state of fresh episodes; the state made ready for a rollout with new weights
+#   step, reset                    take a step, which also stores what the update needs; forget where an episode ended
+#   cut, unroll                    cut a rollout into pieces; compute whole pieces at once in the update
+#   rewind                         go back to the rollout's first step, to store all of it again (--refresh-memory)
+#   logs                           numbers for TensorBoard
+#   not_saved                      fields of the state that no checkpoint holds
 class MemoryState(NamedTuple):
     """What N environments remember. `t` and `hidden` are replaced step by step, `stored` is written in place."""
 
@@ -699,14 +703,10 @@ class MemoryLimit(ValueError):
     """An episode is longer than the memory allows; says which flag helps. `Memory.step` may raise it."""
 
 
-class RunError(RuntimeError):
-    """Training cannot go on, for a reason outside of it: a full disk, a process that is gone. Says which, in a line."""
-
-
 # ---- 6 TRAINING ----
 @dataclass
 class Rollout:
-    """T steps of N environments to learn from, and what the next rollout goes on with; not_saved by each one."""
+    """T steps of N environments to learn from, and what the next rollout goes on with; overwritten by each."""
 
     obs: dict[str, Tensor]  # each (T, N, ...): uint8 pixels stay uint8
     actions: Tensor  # (T, N, A)
@@ -1021,6 +1021,10 @@ def level_scores(args: Args, run: "Run") -> dict[str, Tensor]:
 
 
 # ---- 8 RUNNING ----
+class RunError(RuntimeError):
+    """Training cannot go on, for a reason outside of it: a full disk, a process that is gone. Says which, in a line."""
+
+
 @dataclass
 class Run:
     """All that training needs, made by `setup`."""
@@ -1065,7 +1069,7 @@ def parse_args(argv: list[str]) -> Args:
     first.add_argument("--preset")
     first.add_argument("--resume")
     given = first.parse_known_args(argv)[0]
-    default = Args(**PRESETS.get(given.preset, {}))  # an unknown one is told by tyro, as all errors are
+    default = Args(**PRESETS.get(given.preset, {}))  # tyro reports an unknown one, as all errors
     if given.resume is not None:
         default = saved_args(read_checkpoint(given.resume))
     laptop = as_flags(PRESETS["laptop"])
@@ -1747,7 +1751,7 @@ class GRUScan(torch.autograd.Function):
     def forward(ctx, inputs: Tensor, first: Tensor, weight: Tensor, bias: Tensor, sizes: list[int]) -> Tensor:
         """Run the recurrence, keeping every gate for the backward pass."""
         width = first.shape[1]
-        gates = inputs.clone()  # (B, 3D) the projected inputs, step by step not_saved with r, z and n
+        gates = inputs.clone()  # (B, 3D) the projected inputs, overwritten step by step with r, z and n
         states, before, candidates = (inputs.new_empty(len(inputs), width) for _ in range(3))  # (B, D) each
         transposed, state = weight.T.contiguous(), first
         steps = zip(*(each.split(sizes) for each in (gates, before, candidates, states)), strict=True)

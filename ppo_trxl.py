@@ -4,7 +4,8 @@
 
 The agent gets one observation at a time. Every step leaves an item in the episodic memory: the inputs of the
 transformer's blocks. Each block of a later step attends to the items of the last --trxl-memory-length steps of the
-episode. Items are stored as they are and pass no gradient; they were computed with the weights of their rollout.
+episode. Items are stored without gradient, as the weights of their rollout computed them; --trxl-memory-gradient
+computes those of the same segment again, with gradient, and --refresh-memory those of the rollout before each epoch.
 
 A window is never gathered for every query. While acting, each item is projected to its key and value once, into a cache
 that is computed again after each update. For the update, the steps of an environment's rollout and the window before
@@ -20,8 +21,8 @@ the same with another one, but for its flags. What evaluates (7), what runs a tr
 line) and what only makes it faster (9) may be skipped.
 
 Shape letters: T steps of a rollout, N environments, A action branches, B samples of a minibatch, S segments of a
-minibatch, L steps of the longest, W window, M items that a segment looks at, K blocks, H heads, D width of the memory,
-F features, G entries of the ground truth, V entries of a vector.
+minibatch, L steps of the longest, W window, M items that a segment looks at, K blocks, H heads, I inputs and D width of
+the memory, F features, G entries of the ground truth, V entries of a vector.
 """
 
 import argparse
@@ -99,7 +100,8 @@ class Args:
     exp_name: str = "ppo_trxl"
     """name of the experiment, part of the run folder's name"""
     preset: Literal["thesis", "laptop"] = "thesis"
-    """a set of defaults, told above, that the command line begins with; flags that are given win over it"""
+    """a set of defaults, listed above, that the command line begins with; flags that are given win over it (in Python:
+    Args(**PRESETS["laptop"]))"""
     seed: NonNegativeInt = 1
     """seed of the weights, the actions and the environments: same seed, same curves (on the CPU to the last bit)"""
     torch_deterministic: bool = True
@@ -169,7 +171,7 @@ class Args:
     gae_lambda: UnitInterval = 0.95
     """lambda of generalized advantage estimation"""
     refresh_memory: bool = False
-    """before every epoch but the first, compute again what the rollout stored of memory, with the present weights"""
+    """before every epoch but the first, recompute the memory that the rollout stored, with the present weights"""
     bootstrap_truncated: bool = False
     """value the final observation of an episode that a time limit cut short, instead of counting it as ended"""
     norm_adv: Literal["none", "minibatch", "batch"] = "none"
@@ -577,11 +579,14 @@ class Decoder(nn.Sequential):
 
 
 # ---- 4 MEMORY ----
-# What the other sections use of a memory, whichever it is: Memory(args, inputs), an nn.Module from I inputs to width D,
-# and its MemoryState. While acting: initial_state, begin_rollout, step (which also stores what the update needs), reset
-# where an episode ended. For the update: cut the rollout into pieces, and unroll pieces; rewind to the rollout's first
-# step, to store all again. And logs, numbers for TensorBoard. A checkpoint holds the MemoryState, but for the fields in
-# `not_saved`.
+# Memory(args, inputs) is an nn.Module that maps I inputs to width D; a MemoryState is what it remembers. What the other
+# sections use of any memory:
+#   initial_state, begin_rollout   the state of fresh episodes; the state made ready for a rollout with new weights
+#   step, reset                    take a step, which also stores what the update needs; forget where an episode ended
+#   cut, unroll                    cut a rollout into pieces; compute whole pieces at once in the update
+#   rewind                         go back to the rollout's first step, to store all of it again (--refresh-memory)
+#   logs                           numbers for TensorBoard
+#   not_saved                      fields of the state that no checkpoint holds
 def visible(age: Tensor, episode_step: Tensor, window: int) -> Tensor:
     """Return whether a query at this step of its episode sees the item that was stored `age` steps before it.
 
@@ -793,8 +798,8 @@ class Memory(nn.Module):
     def step(self, x: Tensor, state: MemoryState) -> tuple[Tensor, MemoryState]:
         """Take one step of all environments: x (N, D) to (N, D), and the state after it. Stores the step's item.
 
-        Who only wants a value keeps the given state and takes the step again: that overwrites row `now`, which no query
-        of this step sees. Raises MemoryLimit if an episode outlasts a learned encoding's table.
+        To get a value only, discard the returned state: the next call overwrites row `now`, which no query of this step
+        sees. Raises MemoryLimit if an episode outlasts a learned encoding's table.
         """
         self.check_length(state.episode_step)
         rows, age, seen = self.look_back(state)
@@ -973,14 +978,10 @@ class MemoryLimit(ValueError):
     """An episode is longer than the memory allows; says which flag helps. `Memory.step` may raise it."""
 
 
-class RunError(RuntimeError):
-    """Training cannot go on, for a reason outside of it: a full disk, a process that is gone. Says which, in a line."""
-
-
 # ---- 6 TRAINING ----
 @dataclass
 class Rollout:
-    """T steps of N environments to learn from, and what the next rollout goes on with; not_saved by each one."""
+    """T steps of N environments to learn from, and what the next rollout goes on with; overwritten by each."""
 
     obs: dict[str, Tensor]  # each (T, N, ...): uint8 pixels stay uint8
     actions: Tensor  # (T, N, A)
@@ -1295,6 +1296,10 @@ def level_scores(args: Args, run: "Run") -> dict[str, Tensor]:
 
 
 # ---- 8 RUNNING ----
+class RunError(RuntimeError):
+    """Training cannot go on, for a reason outside of it: a full disk, a process that is gone. Says which, in a line."""
+
+
 @dataclass
 class Run:
     """All that training needs, made by `setup`."""
@@ -1339,7 +1344,7 @@ def parse_args(argv: list[str]) -> Args:
     first.add_argument("--preset")
     first.add_argument("--resume")
     given = first.parse_known_args(argv)[0]
-    default = Args(**PRESETS.get(given.preset, {}))  # an unknown one is told by tyro, as all errors are
+    default = Args(**PRESETS.get(given.preset, {}))  # tyro reports an unknown one, as all errors
     if given.resume is not None:
         default = saved_args(read_checkpoint(given.resume))
     laptop = as_flags(PRESETS["laptop"])
