@@ -2,9 +2,9 @@
 
     python benchmarks/window_probe.py runs/RUN/model.pt --windows 32 64 128 256
 
-The window is no weight: the same agent plays the same unseen levels with each (as evaluate.py does). Where a narrower
-window costs it its score, it looked further back than that; where a wider one brings nothing, its window is not what
-ends its episodes.
+The window is no weight: the same agent plays the same unseen levels with each (as evaluate.py does). A lower score with
+a narrower window suggests that it used what this one does not show. That a wider one brings nothing says little, since
+the agent has not learned with it.
 """
 
 import sys
@@ -35,27 +35,31 @@ class Config:
     """steps after which an endless episode is cut short"""
 
 
-def row(checkpoint: evaluate.Checkpoint, window: int) -> str:
-    """Return the row of a window: the family's own metric, and how long the episodes are."""
-    trained = checkpoint.args.trxl_memory_length
+def row(checkpoint: evaluate.Checkpoint, window: int, metric: str) -> str:
+    """Return the row of a window; raise ValueError where an episode was cut short, which has no final score."""
     played = evaluate.play(replace(checkpoint, args=replace(checkpoint.args, trxl_memory_length=window)), seed=1)
-    scores, lengths = played[evaluate.own_metric(checkpoint.args.env_id)], played["length"]
-    name = f"{window}, as trained" if window == trained else str(window)
+    if not played["finished"].all():
+        limit = checkpoint.args.eval_max_steps
+        raise ValueError(f"with a window of {window}, --max-steps {limit} cut episodes short; give more steps")
+    scores, lengths = played[metric], played["length"]
+    name = f"{window}, as trained" if window == checkpoint.args.trxl_memory_length else str(window)
     score = f"{scores.mean():.2f} | {evaluate.iqm(scores[None]):.2f}"
     return f"| {name} | {score} | {np.median(lengths):.0f} | {lengths.max():.0f} |"
 
 
 def main(config: Config) -> None:
-    """Print a table, a window a row; raise SystemExit for a checkpoint of another script, and what evaluate raises."""
+    """Print a table, a window a row; raise ValueError for what cannot be played, and what evaluate.py raises."""
+    if min(config.windows) < 1:
+        raise ValueError(f"--windows has {min(config.windows)}; a window is 1 step or more")
     settings = evaluate.Config(levels=config.levels, repeats=config.repeats, max_steps=config.max_steps)
     checkpoint = evaluate.Checkpoint.read(config.checkpoint, settings)
     if checkpoint.script is not ppo_trxl:
         script = checkpoint.script.__name__
-        raise SystemExit(
+        raise ValueError(
             f"{config.checkpoint} was trained by {script}.py; only transformers of ppo_trxl.py have a window"
         )
     metric = evaluate.own_metric(checkpoint.args.env_id)
-    rows = [row(checkpoint, window) for window in tqdm(config.windows, unit=" windows")]
+    rows = [row(checkpoint, window, metric) for window in tqdm(config.windows, unit=" windows")]
     print(f"| window | {metric}, mean | IQM | length of an episode, median | longest |\n|---:|---:|---:|---:|---:|")
     print("\n".join(rows))
 

@@ -35,7 +35,15 @@ def test_rows_of_the_windows(tiny, monkeypatch, capsys):
     assert float(trained[4]) == np.max(played["length"])
 
 
-def test_only_a_transformer_has_a_window(tiny):
-    folder = ppo_gru.main(tiny(**TASK))
-    with pytest.raises(SystemExit, match=r"model\.pt was trained by ppo_gru\.py; only transformers"):
-        window_probe.main(window_probe.Config(f"{folder}/model.pt"))
+@pytest.mark.parametrize(
+    ("script", "changes", "told"),
+    [
+        (ppo_gru, {}, r"model\.pt was trained by ppo_gru\.py; only transformers"),
+        (ppo_trxl, {"windows": (4, 0)}, "--windows has 0; a window is 1 step or more"),
+        (ppo_trxl, {"windows": (4,), "max_steps": 2}, "with a window of 4, --max-steps 2 cut episodes short"),
+    ],
+)
+def test_what_cannot_be_played(tiny, script, changes, told):
+    folder = script.main(tiny(script, **TASK))
+    with pytest.raises(ValueError, match=told):
+        window_probe.main(window_probe.Config(f"{folder}/model.pt", levels=2, repeats=1, **changes))
