@@ -161,48 +161,64 @@ class Config(Training):
     """draw the curves to OUT.png and OUT.svg"""
 
 
-def steps_of(config: Training, task: Task) -> int:
-    """Return the steps that a run trains for."""
-    return int(task.total_timesteps * config.steps_scale)
-
-
 def file_name(agent: str) -> str:
     """Return an agent's name as part of a file's name."""
     return re.sub(r"\W+", "-", agent)
 
 
-def command(config: Training, task: Task, agent: str, seed: int) -> list[str]:
-    """Return the command line of a training run."""
+@dataclass(frozen=True)
+class Plan:
+    """A training run that is wanted, whether it has been done or not."""
+
+    task: Task
+    agent: str
+    seed: int
+    command: tuple[str, ...]
+    args: Any  # what the command's flags stand for, the script's Args
+
+    def __str__(self) -> str:
+        return f"{self.agent} on {self.task.env_id}, seed {self.seed}"
+
+    def logged_args(self) -> dict[str, str]:
+        """Return the arguments as text, as a run that was read has them."""
+        texts = {name: " ".join(str(value).split()) for name, value in asdict(self.args).items()}
+        return {"script": Path(self.command[1]).stem, **texts}
+
+
+def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
+    """Plan a training run; an agent is a name in `AGENTS`, which further flags may follow.
+
+    Raises SystemExit for flags that the script does not have, or a share of the steps that is not above 0.
+    """
+    if config.steps_scale <= 0:
+        raise SystemExit(f"--steps-scale is {config.steps_scale}; it must be above 0")
     name, dashes, further = agent.partition(" --")
     script, *memory = AGENTS[name].split()
-    steps = steps_of(config, task)
+    steps = str(int(task.total_timesteps * config.steps_scale))
     flags = [*COMMON.split(), *memory, *task.flags.split(), *(task.trxl_flags.split() if "trxl" in script else [])]
-    flags += ["--total-timesteps", str(steps), "--anneal-steps", str(steps)]
+    flags += ["--total-timesteps", steps, "--anneal-steps", steps]
     flags += ["--env-id", task.env_id, "--env-options", json.dumps(task.options)]
     flags += ["--exp-name", file_name(agent), "--seed", str(seed)]
     flags += f"{dashes}{further}".split()
-    args = parsed(script, flags)
-    every = max(1, steps // (args.num_envs * args.num_steps) // config.evaluations)
-    return [sys.executable, str(ROOT / script), *flags, "--eval-interval", str(every)]
+    args = importlib.import_module(Path(script).stem).parse_args(flags)
+    iterations = args.total_timesteps // (args.num_envs * args.num_steps)
+    args.eval_interval = max(1, iterations // config.evaluations)
+    flags += ["--eval-interval", str(args.eval_interval)]
+    return Plan(task, agent, seed, (sys.executable, str(ROOT / script), *flags), args)
 
 
-def parsed(script: str, flags: list[str]) -> Any:
-    """Return the script's Args for these flags."""
-    return importlib.import_module(Path(script).stem).parse_args(flags)
-
-
-def runs_in(place: str, config: Training, task: Task, agent: str, seed: int) -> list[evaluate.RunLog]:
-    """Return the runs with these arguments among the folders, or the files of results, in a place."""
-    wanted, found = arguments(command(config, task, agent, seed)), []
-    for path in sorted(glob.glob(f"{place}/{task.env_id}__{file_name(agent)}__{seed}__*")):
+def runs_in(place: str, plan: Plan) -> list[evaluate.RunLog]:
+    """Return the runs that were planned so among the folders, or the files of results, in a place."""
+    wanted, found = plan.logged_args(), []
+    for path in sorted(glob.glob(f"{place}/{plan.task.env_id}__{file_name(plan.agent)}__{plan.seed}__*")):
         with contextlib.suppress(evaluate.NoCurvesError):
             found.append(evaluate.read_run(path))
     return [run for run in found if {**run.args, "resume": "None"} == wanted]
 
 
-def result_of(config: Training, task: Task, agent: str, seed: int) -> evaluate.RunLog | None:
-    """Return the finished run with these arguments, if its result is there."""
-    return next(iter(runs_in(str(config.results), config, task, agent, seed)), None)
+def result_of(config: Training, plan: Plan) -> evaluate.RunLog | None:
+    """Return the finished run, if its result is there."""
+    return next(iter(runs_in(str(config.results), plan)), None)
 
 
 def is_complete(run: evaluate.RunLog) -> bool:
@@ -211,24 +227,18 @@ def is_complete(run: evaluate.RunLog) -> bool:
     return run.has_seconds() and run.curves["charts/seconds_iteration"][0][-1] + math.prod(batch) > total
 
 
-def arguments(line: list[str]) -> dict[str, str]:
-    """Return a command line's arguments as a run that was read has them."""
-    args = asdict(parsed(line[1], line[2:]))
-    return {"script": Path(line[1]).stem} | {name: " ".join(str(value).split()) for name, value in args.items()}
-
-
 RUNNING = set()  # training processes, to be stopped with this one
 
 
-def train(config: Training, task: Task, agent: str, seed: int) -> None:
+def train(config: Training, plan: Plan) -> None:
     """Run a training, or go on with one that was stopped; raise SystemExit that names its log if it fails."""
-    line = command(config, task, agent, seed)
-    for run in runs_in(f"{config.folder}/runs", config, task, agent, seed):
+    line = plan.command
+    for run in runs_in(f"{config.folder}/runs", plan):
         if glob.glob(f"{run.path}/checkpoint-*.pt"):
             line = [*line[:2], "--resume", os.path.relpath(run.path, config.folder)]
     threads = str(max(1, (os.cpu_count() or 1) // config.jobs))
-    task_hash = zlib.crc32(json.dumps(asdict(task)).encode())
-    log = config.folder / f"{task.env_id}-{file_name(agent)}-{seed}-{task_hash:08x}.log"
+    task_hash = zlib.crc32(json.dumps(asdict(plan.task)).encode())
+    log = config.folder / f"{plan.task.env_id}-{file_name(plan.agent)}-{plan.seed}-{task_hash:08x}.log"
     environment = {**os.environ, "OMP_NUM_THREADS": threads, "TQDM_MININTERVAL": "10"}
     with log.open("a") as output:
         # In a session of its own, Ctrl-C does not reach it: `train_missing` stops it, so that it leaves a checkpoint.
@@ -238,48 +248,47 @@ def train(config: Training, task: Task, agent: str, seed: int) -> None:
             code = process.wait()
             RUNNING.remove(process)
     if code == 0:
-        tqdm.write(f"trained {agent} on {task.env_id}, seed {seed}")
+        tqdm.write(f"trained {plan}")
     elif code not in (-signal.SIGTERM, 128 + signal.SIGTERM):  # stopped before its first iteration, or after one
-        raise SystemExit(f"{agent} on {task.env_id}, seed {seed}, failed: see {log}")
+        raise SystemExit(f"{plan}, failed: see {log}")
 
 
-def write_result(config: Training, task: Task, agent: str, seed: int) -> None:
+def write_result(config: Training, plan: Plan) -> None:
     """Train if that has not been done, and write what the run reached.
 
     Raises SystemExit if it was stopped, or has no score at its end.
     """
-    wanted = (f"{config.folder}/runs", config, task, agent, seed)
-    if not any(map(is_complete, runs_in(*wanted))):
-        train(config, task, agent, seed)
-    run = next(filter(is_complete, runs_in(*wanted)), None)
+    folder = f"{config.folder}/runs"
+    if not any(map(is_complete, runs_in(folder, plan))):
+        train(config, plan)
+    run = next(filter(is_complete, runs_in(folder, plan)), None)
     if run is None:
-        raise SystemExit(f"{agent} on {task.env_id}, seed {seed}, was stopped; the same command goes on with it")
-    steps, _ = run.curves.get(f"eval/{task.metric}", ([0], None))
+        raise SystemExit(f"{plan}, was stopped; the same command goes on with it")
+    metric = plan.task.metric
+    steps, _ = run.curves.get(f"eval/{metric}", ([0], None))
     if steps[-1] != run.curves["charts/seconds_iteration"][0][-1]:
         raise SystemExit(
-            f"{agent} on {task.env_id}, seed {seed}, has no {task.metric} at its end: an evaluation was cut short; "
-            f'give the agent more steps, as "{agent} --eval-max-steps 100000"'
+            f"{plan}, has no {metric} at its end: an evaluation was cut short; give the agent more steps, as "
+            f'"{plan.agent} --eval-max-steps 100000"'
         )
     evaluate.write_run(run, f"{config.results}/{Path(run.path).name}.json.gz")
 
 
-def train_missing(config: Training, wanted: list[tuple[Task, str, int]]) -> None:
+def train_missing(config: Training, wanted: list[Plan]) -> None:
     """Do the trainings that have no result, some at a time, and show how long it takes.
 
-    Raises SystemExit, at the end, if some failed, and for steps that are no number of steps.
+    Raises SystemExit, at the end, if some failed.
     """
-    if config.steps_scale <= 0:
-        raise SystemExit(f"--steps-scale is {config.steps_scale}; it must be above 0")
     for folder in (config.folder, config.results):
         folder.mkdir(parents=True, exist_ok=True)
-    each_once = {tuple(command(config, *run)): run for run in wanted}.values()
-    missing = [run for run in each_once if result_of(config, *run) is None]
-    steps, failed = sum(steps_of(config, task) for task, _, _ in missing), []
+    each_once = {plan.command: plan for plan in wanted}.values()
+    missing = [plan for plan in each_once if result_of(config, plan) is None]
+    steps, failed = sum(plan.args.total_timesteps for plan in missing), []
     with (
         ThreadPoolExecutor(config.jobs) as pool,
         tqdm(total=steps, unit=" steps", unit_scale=True, disable=not missing) as bar,
     ):
-        trainings = {pool.submit(write_result, config, *run): run[0] for run in missing}
+        trainings = {pool.submit(write_result, config, plan): plan for plan in missing}
         try:
             for training in as_completed(trainings):
                 try:
@@ -287,7 +296,7 @@ def train_missing(config: Training, wanted: list[tuple[Task, str, int]]) -> None
                 except SystemExit as error:
                     failed.append(str(error))
                     tqdm.write(failed[-1])
-                bar.update(steps_of(config, trainings[training]))
+                bar.update(trainings[training].args.total_timesteps)
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in RUNNING.copy():
@@ -310,11 +319,11 @@ def row(agent: str, runs: list[evaluate.RunLog], metric: str, best: float) -> st
     return f"| {' | '.join(map(str, cells))} |"
 
 
-def report(config: Config, task: Task, runs: dict[str, list[evaluate.RunLog]]) -> None:
-    """Print a task's table: each agent's runs, an evaluated seed each."""
+def report(task: Task, steps: int, runs: dict[str, list[evaluate.RunLog]]) -> None:
+    """Print a task's table: the runs of each agent, one a seed."""
     curves = [evaluate.align([run.curves[f"eval/{task.metric}"] for run in each]) for each in runs.values()]
     best = max(evaluate.iqm(scores[-1]) for _, scores in curves)
-    print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {steps_of(config, task):,} steps\n")
+    print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {steps:,} steps\n")
     print("| agent | seeds | mean | IQM | 95 % interval | steps to 0.9 of the best | minutes | minutes in all |")
     print("|---|---:|---:|---:|---|---:|---:|---:|")
     for agent, each in runs.items():
@@ -322,20 +331,28 @@ def report(config: Config, task: Task, runs: dict[str, list[evaluate.RunLog]]) -
 
 
 def main(config: Config) -> None:
-    """Train what is missing, then print the tables and draw the curves."""
+    """Train what is missing, then print the tables and draw the curves.
+
+    Raises SystemExit for names that it does not know, for what cannot be planned, and for trainings that failed.
+    """
     suite_tasks, suite_agents = SUITES[config.suite]
     tasks, agents = config.tasks or suite_tasks, config.agents or suite_agents
     for given, known in ((tasks, TASKS), ([agent.partition(" --")[0] for agent in agents], AGENTS)):
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"there is no {unknown[0]}; there are {', '.join(known)}")
-    wanted = [(TASKS[task], agent, seed) for task in tasks for seed in config.seeds for agent in agents]
-    train_missing(config, wanted)
-    paths = []
-    for task in map(TASKS.get, tasks):
-        runs = {agent: [result_of(config, task, agent, seed) for seed in config.seeds] for agent in agents}
-        report(config, task, runs)
-        paths += [run.path for each in runs.values() for run in each]
-    evaluate.draw_curves(evaluate.Config(curves=tuple(paths), out=str(config.out)))
+    # All are planned here: tyro, which parses their command lines, is not made for several threads.
+    plans = {
+        (task, agent, seed): plan(config, TASKS[task], agent, seed)
+        for task in tasks
+        for seed in config.seeds
+        for agent in agents
+    }
+    train_missing(config, [*plans.values()])
+    runs = {key: result_of(config, each) for key, each in plans.items()}
+    for name in tasks:
+        steps = plans[name, agents[0], config.seeds[0]].args.total_timesteps
+        report(TASKS[name], steps, {agent: [runs[name, agent, seed] for seed in config.seeds] for agent in agents})
+    evaluate.draw_curves(evaluate.Config(curves=tuple(run.path for run in runs.values()), out=str(config.out)))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """benchmarks/claims.py: its verdicts, and one claim from its trainings to its row."""
 
-from pathlib import Path
-
 import claims
 import learning
 import numpy as np
@@ -20,6 +18,8 @@ import pytest
         ([[4, 5, 6], [1, 2, 3]], [[1, 2, 3]], False, "contradicted"),
         ([[4, 5, 6]], [[1, 2, 4]], False, "not contradicted"),
         ([[1, 2, 3]], [[4, 5, 6]], False, "not contradicted"),
+        ([[4, 5]], [[1, 2]], True, "not decided"),  # two seeds are too few
+        ([[4, 5]], [[1, 2]], False, "not decided"),
     ],
 )
 def test_verdicts(higher, lower, expects_difference, verdict):
@@ -30,13 +30,12 @@ def test_verdicts(higher, lower, expects_difference, verdict):
 @pytest.mark.parametrize("name", claims.CLAIMS)
 def test_every_claim_compares_agents_that_can_be_trained(name):
     claim = claims.CLAIMS[name]
-    lines = [
-        learning.command(claims.Config(), claim.task, agent, seed)
+    plans = [
+        learning.plan(claims.Config(), claim.task, agent, seed)
         for agent in (*claim.higher, *claim.lower)
         for seed in (1, 2)
     ]
-    arguments = [learning.arguments([line[0], Path(line[1]).name, *line[2:]]) for line in lines]
-    assert len({tuple(each.items()) for each in arguments}) == len(lines), "no two are the same"
+    assert len({tuple(plan.logged_args().items()) for plan in plans}) == len(plans), "no two are the same"
 
 
 def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
@@ -49,10 +48,12 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     told = capsys.readouterr().out
     assert told.count("trained GRU") == 8
     agents = (claims.NORMALIZED, claims.NOT_NORMALIZED)
-    runs = {agent: [learning.result_of(config, claims.ALL_IN_VIEW, agent, seed) for seed in (1, 2)] for agent in agents}
-    norms = {agent: [run.curves["losses/grad_norm"][1].mean() for run in each] for agent, each in runs.items()}
+    norms = {}
+    for agent in agents:
+        plans = [learning.plan(config, claims.ALL_IN_VIEW, agent, seed) for seed in (1, 2)]
+        norms[agent] = [learning.result_of(config, plan).curves["losses/grad_norm"][1].mean() for plan in plans]
     figures = [f"{agent} {np.mean(x):.3g} ({min(x):.3g} to {max(x):.3g})" for agent, x in norms.items()]
-    row = "| 7.2 | normalized advantages make gradients 12 times as large | `normalized-gradients` | gradient norm: "
+    row = "| 7.2 | normalized advantages make gradients larger (12 times) | `normalized-gradients` | gradient norm: "
     assert told.splitlines()[-1].startswith(row + "; ".join(figures))
     claims.main(config)
     assert "trained" not in capsys.readouterr().out

@@ -17,8 +17,7 @@ import ppo_gru
 @pytest.mark.parametrize("task", learning.TASKS)
 @pytest.mark.parametrize("agent", learning.AGENTS)
 def test_every_agent_s_command_can_be_parsed(task, agent):
-    line = learning.command(learning.Config(steps_scale=6), learning.TASKS[task], agent, 2)
-    args = learning.parsed(Path(line[1]).name, line[2:])
+    args = learning.plan(learning.Config(steps_scale=6), learning.TASKS[task], agent, 2).args
     assert args.total_timesteps == args.anneal_steps == 6 * learning.TASKS[task].total_timesteps
     assert args.refresh_memory == ("refreshed" in agent)
     assert getattr(args, "trxl_memory_gradient", False) == ("gradient" in agent)
@@ -28,13 +27,17 @@ def test_every_agent_s_command_can_be_parsed(task, agent):
 def test_an_agent_may_have_further_flags(tmp_path):
     task = learning.TASKS["mystery-path"]
     agent = "TrXL, gradient --trxl-num-layers 3 --trxl-positional-encoding learned"
-    line = learning.command(learning.Config(), task, agent, 1)
-    args = learning.parsed(Path(line[1]).name, line[2:])
+    args = learning.plan(learning.Config(), task, agent, 1).args
     assert args.trxl_memory_gradient
     assert (args.trxl_num_layers, args.trxl_positional_encoding) == (3, "learned")  # the task's own flags come first
     assert args.exp_name == "TrXL-gradient-trxl-num-layers-3-trxl-positional-encoding-learned"
     with pytest.raises(SystemExit, match=r"there is no TrXXL; there are no memory, stack of 4, .*GRU"):
         learning.main(learning.Config(agents=("GRU", "TrXXL --trxl-num-layers 3"), folder=tmp_path))
+
+
+def test_a_share_of_the_steps_is_above_0():
+    with pytest.raises(SystemExit, match="--steps-scale is 0; it must be above 0"):
+        learning.plan(learning.Config(steps_scale=0), learning.TASKS["mortar-mayhem"], "GRU", 1)
 
 
 def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, capsys):
@@ -53,22 +56,24 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     )
     config.folder.mkdir()
     monkeypatch.chdir(config.folder)
-    args = ppo_gru.parse_args(learning.command(config, task, agent, 1)[2:])
+    plan = learning.plan(config, task, agent, 1)
+    args = ppo_gru.parse_args(plan.command[2:])
+    assert args == plan.args
     run = ppo_gru.setup(args)
     run.received_signal = signal.SIGTERM  # during the first of three iterations
     ppo_gru.run_to_end(args, run)
 
     def trainings():
-        return learning.runs_in(str(config.folder / "runs"), config, task, agent, 1)
+        return learning.runs_in(str(config.folder / "runs"), plan)
 
     assert [learning.is_complete(each) for each in trainings()] == [False]
-    assert learning.result_of(config, task, agent, 1) is None
+    assert learning.result_of(config, plan) is None
 
     learning.main(config)
     assert f"trained {agent} on {task.env_id}, seed 1" in capsys.readouterr().out
     (whole,) = trainings()
     assert (learning.is_complete(whole), whole.path) == (True, str(config.folder / run.folder))
-    kept = learning.result_of(config, task, agent, 1)
+    kept = learning.result_of(config, plan)
     assert kept.args == whole.args
     for name in ("eval/commands_completed", "eval/return", "eval/length", "charts/seconds_iteration"):
         for one, other in zip(kept.curves[name], whole.curves[name], strict=True):
@@ -86,9 +91,9 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
 def test_a_failed_run_stops_no_other(tmp_path, monkeypatch):
     done = []
 
-    def train(config, task, agent, seed):
-        done.append(seed)
-        if seed == 1:
+    def train(config, plan):
+        done.append(plan.seed)
+        if plan.seed == 1:
             raise SystemExit("seed 1 failed: see its.log")
 
     monkeypatch.setattr(learning, "train", train)
@@ -121,7 +126,7 @@ def test_committed_results_are_those_of_today_s_commands(steps_scale):
     results = Path(learning.__file__).parent / "results"
     task = learning.TASKS["mortar-mayhem" if steps_scale == 1 else "endless-mortar-mayhem"]
     config = learning.Config(steps_scale=steps_scale, results=results)
-    runs = [learning.result_of(config, task, "GRU", seed) for seed in (1, 2)]
+    runs = [learning.result_of(config, learning.plan(config, task, "GRU", seed)) for seed in (1, 2)]
     assert all(map(learning.is_complete, runs))
     assert all(len(run.curves["eval/commands_completed"][0]) >= config.evaluations for run in runs)
 
