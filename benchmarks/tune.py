@@ -70,7 +70,7 @@ try:
     from matplotlib import color_sequences
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator, NullLocator
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
     from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, distribution_to_json
     from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
     from optuna.storages.journal import JournalFileBackend, JournalStorage
@@ -127,9 +127,9 @@ SLICES = 24  # S
 WARM_UP = SLICES // 4  # slices before a trial may be pruned
 UNPRUNED_TRIALS = 8  # complete trials before the first may be pruned
 COMMANDS = 20  # that count as a score of 1 in the endless task
-SHOWN = 5  # of the best trials
+BEST_SHOWN = 5  # trials
 PRESET = "preset"  # the name of the trial with the preset's settings
-FEW = 10  # complete trials, with fewer of which no importances are told
+IMPORTANCES_FROM = 10  # complete trials; from fewer, they would be noise
 
 
 @dataclass
@@ -219,8 +219,8 @@ def score(curves: np.ndarray) -> float:
     return float(np.mean([area_and_low(curve) for curve in curves]))
 
 
-def secured(curves: np.ndarray) -> float:
-    """Return what the slices so far, (trainings, at most S), leave of a score at least."""
+def lower_bound(curves: np.ndarray) -> float:
+    """Return the score that is certain after the slices so far, (trainings, at most S): as if the others were 0."""
     return float(curves.sum(1).mean() / SLICES / 2)
 
 
@@ -291,7 +291,7 @@ def run_trial(trial: optuna.Trial, config: Config) -> float | None:
         curves = np.empty((len(trainings), 0))
         while curves.shape[1] < SLICES:
             curves = np.column_stack([curves, [next(training) for training in trainings]])
-            trial.report(secured(curves), curves.shape[1] - 1)
+            trial.report(lower_bound(curves), curves.shape[1] - 1)
             is_last = curves.shape[1] == SLICES
             if not is_last and trial.should_prune():
                 break
@@ -365,7 +365,7 @@ def first_trials(config: Config) -> dict[str, dict[str, Any]]:
     first = {PRESET: preset_params(config.script)}
     if config.again is not None:
         found = best_trials(load_study(replace(config, folder=config.again)))
-        others = [trial for trial in found if name_of(trial) != PRESET][:SHOWN]
+        others = [trial for trial in found if name_of(trial) != PRESET][:BEST_SHOWN]
         first |= {f"{name_of(trial)} of {config.again.name}": trial.params for trial in others}
     return first
 
@@ -429,9 +429,9 @@ def finish(study: optuna.Study, trial: optuna.Trial, config: Config) -> None:
         study.tell(trial, state=TrialState.FAIL)
         raise
     study.tell(trial, value, state=TrialState.PRUNED if value is None else TrialState.COMPLETE)
-    told = trial.user_attrs
-    result = f"pruned after {len(told['curves'][0])} of {SLICES} slices" if value is None else f"score {value:.3f}"
-    print(f"trial {trial.number}: {result}, {told['seconds']:.0f} s", flush=True)
+    found = trial.user_attrs
+    result = f"pruned after {len(found['curves'][0])} of {SLICES} slices" if value is None else f"score {value:.3f}"
+    print(f"trial {trial.number}: {result}, {found['seconds']:.0f} s", flush=True)
 
 
 def worker_process(config: Config, worker: int, until: float) -> None:
@@ -487,7 +487,7 @@ def importances(study: optuna.Study, complete: list[FrozenTrial]) -> dict[str, f
 
     The numbers sum to 1. There are none where complete trials are few.
     """
-    if len(complete) < FEW:
+    if len(complete) < IMPORTANCES_FROM:
         return {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
@@ -524,14 +524,14 @@ def report(config: Config) -> None:
     study = load_study(config)
     complete = best_trials(study)
     states = [trial.state for trial in study.get_trials(deepcopy=False)]
-    told = ", ".join(f"{states.count(state)} {state.name.lower()}" for state in dict.fromkeys(states))
-    shown = [*complete[:SHOWN], *(trial for trial in complete[SHOWN:] if "name" in trial.user_attrs)]
+    counts = ", ".join(f"{states.count(state)} {state.name.lower()}" for state in dict.fromkeys(states))
+    shown = [*complete[:BEST_SHOWN], *(trial for trial in complete[BEST_SHOWN:] if "name" in trial.user_attrs)]
     tasks = list(study.user_attrs["search"]["--tasks"])
-    print(f"\n{config.script}, trials: {told}\n\n{trials_table(shown, tasks)}\n")
+    print(f"\n{config.script}, trials: {counts}\n\n{trials_table(shown, tasks)}\n")
     print(f"The best one: `{flags_of(complete[0].params)}`\n")
     found = importances(study, complete)
     if not found:
-        print(f"Importances are told from {FEW} complete trials on.")
+        print(f"There are importances from {IMPORTANCES_FROM} complete trials on.")
     else:
         print("| parameter | importance |\n|---|---:|")
         print("\n".join(f"| {name} | {value:.2f} |" for name, value in found.items()))
@@ -548,11 +548,13 @@ def draw(study: optuna.Study, names: list[str], out: Path) -> None:
     numbers, values = [trial.number for trial in complete], [trial.value for trial in complete]
     order.plot(numbers, values, "o", color=dot, label="complete")
     order.step(numbers, np.maximum.accumulate(values), color=best, where="post", label="best so far")
-    late = [max(trial.intermediate_values.values()) for trial in pruned]
-    order.plot([trial.number for trial in pruned], late, "x", color=cross, label="pruned: what it had secured")
+    if pruned:
+        late = [max(trial.intermediate_values.values()) for trial in pruned]
+        order.plot([trial.number for trial in pruned], late, "x", color=cross, label="pruned: lower bound of its score")
     for preset in (trial.value for trial in complete if name_of(trial) == PRESET):
         order.axhline(preset, color=line, linestyle="--", label=PRESET)
     order.set(xlabel="trial", ylabel="score", title=f"{study.study_name}: scores of the trials")
+    order.xaxis.set_major_locator(MaxNLocator(integer=True))
     order.legend(fontsize="small")
     for axis, name in zip(others, names, strict=True):
         draw_parameter(axis, name, complete)

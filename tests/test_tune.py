@@ -106,9 +106,9 @@ def test_falling_back_costs():
     assert tune.score(falls) < tune.score(late) < tune.score(steady), "even learning much later is better"
 
 
-def test_what_is_secured_grows_to_at_most_the_score():
+def test_the_lower_bound_grows_to_at_most_the_score():
     curves = np.random.default_rng(1).random((3, 24))
-    reports = [tune.secured(curves[:, : i + 1]) for i in range(24)]
+    reports = [tune.lower_bound(curves[:, : i + 1]) for i in range(24)]
     assert reports == sorted(reports)
     assert reports[-1] == pytest.approx(curves.mean() / 2)
     assert reports[-1] < tune.score(curves)
