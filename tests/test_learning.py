@@ -9,8 +9,10 @@ import time
 from pathlib import Path
 
 import learning
+import numpy as np
 import pytest
 
+import evaluate
 import ppo_gru
 
 
@@ -101,6 +103,18 @@ def test_a_failed_run_stops_no_other(tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match=r"seed 1 failed: see its\.log; GRU on .*, seed 2, was stopped; the same"):
         learning.main(config)
     assert done == [1, 2]
+
+
+def test_a_row_of_the_table():
+    def run(*means):
+        steps = np.array([100, 200, 300])
+        scores = np.broadcast_to(np.reshape(means, (3, 1, 1)), (3, 4, 2))
+        seconds = np.full((3, 1, 1), 60.0)
+        return evaluate.RunLog("", {}, {"eval/coins": (steps, scores), "charts/seconds_iteration": (steps, seconds)})
+
+    row = learning.row("GRU", [run(2, 9, 10), run(7, 3, 8)], "coins", best=6.0)
+    assert row == "| GRU | 2 | 9.00 | 9.00 | 8.00 to 10.00 | 4.00 | 200 | 2.0 | 3.0 |", "the second fell from 7 to 3"
+    assert " | never |  | 3.0 |" in learning.row("GRU", [run(2, 9, 10), run(7, 3, 8)], "coins", best=12.0)
 
 
 @pytest.mark.slow
