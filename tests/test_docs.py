@@ -29,11 +29,11 @@ import ppo_trxl
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 DOCS = sorted((ROOT / "docs").glob("*.md"))
-PAGES = [README, *DOCS]
+PAGES = [README, ROOT / "agents/README.md", *DOCS]
 SCRIPTS = (ppo_gru, ppo_trxl)
 PROGRAMS = [*ROOT.glob("*.py"), *(ROOT / "benchmarks").glob("*.py")]
 
-each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
 
 class Parsed(Exception):
@@ -55,7 +55,9 @@ def commands(page: Path) -> list[str]:
     return sorted({call for call in calls if call.startswith(("python ", "torchrun "))})
 
 
-COMMANDS = {f"{page.stem}-{i}": (page.name, call) for page in PAGES for i, call in enumerate(commands(page))}
+COMMANDS = {
+    f"{page.relative_to(ROOT)}-{i}": (page.name, call) for page in PAGES for i, call in enumerate(commands(page))
+}
 FLAGS = {text: page.name for page in PAGES for text in code(page) if text.startswith("--")}
 each_command = pytest.mark.parametrize(("page", "command"), COMMANDS.values(), ids=COMMANDS)
 each_flag = pytest.mark.parametrize(("flag", "page"), FLAGS.items(), ids=FLAGS)

@@ -1,0 +1,36 @@
+"""The trained agents in agents/ play as well as their table says, and were trained by the command beside it."""
+
+import re
+import shlex
+from dataclasses import asdict
+from pathlib import Path
+
+import learning
+import pytest
+import tyro
+
+import evaluate
+
+AGENTS = Path(__file__).parents[1] / "agents"
+ROWS = re.findall(r"^\| `(\S+)` \| (\w+) \| ([\d.]+) \| `python benchmarks/learning.py (.+)` \|$",
+                  (AGENTS / "README.md").read_text(), re.MULTILINE)  # fmt: skip
+
+
+def test_the_table_has_all_agents():
+    assert [row[0] for row in ROWS] == sorted(path.name for path in AGENTS.glob("*.pt"))
+    sizes = [path.stat().st_size for path in AGENTS.glob("*.pt")]
+    assert max(sizes) < 1e6
+    assert sum(sizes) < 12e6
+
+
+@pytest.mark.parametrize(("name", "metric", "score", "flags"), ROWS, ids=[row[0] for row in ROWS])
+def test_an_agent_plays_as_well_as_published(name, metric, score, flags):
+    checkpoint = evaluate.Checkpoint.read(str(AGENTS / name), evaluate.Config())
+    scores = evaluate.play(checkpoint, seed=1)[metric]  # (M, E)
+    # With other roundings, other actions are drawn: within four standard errors.
+    assert scores.mean() == pytest.approx(float(score), abs=0.005 + 4 * scores.std() / scores.size**0.5)
+
+    config = tyro.cli(learning.Config, args=shlex.split(flags))
+    (task,), (agent,), (seed,) = config.tasks, config.agents, config.seeds
+    planned = learning.plan(config, learning.TASKS[task], agent, seed)
+    assert asdict(planned.args) == asdict(checkpoint.args)
