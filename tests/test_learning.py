@@ -125,7 +125,7 @@ def test_a_stopped_program_stops_its_trainings_with_a_checkpoint(tmp_path):
         while not any("SPS" in log.read_text() for log in tmp_path.glob("*.log")):
             assert time.monotonic() < deadline
             time.sleep(0.1)
-        program.send_signal(signal.SIGINT)  # to it alone; SIGTERM is treated as the same
+        program.terminate()  # to it alone; Ctrl-C is treated as the same, but a shell's background jobs do not get it
         assert program.stderr.read().endswith("stopped; the same command goes on\n")
     assert program.returncode == 1
     (folder,) = tmp_path.glob("runs/*")
