@@ -76,6 +76,7 @@ BOOKKEEPING |= {
     "keep_models",
 }
 RESAMPLES = 2000
+LABEL_WIDTH = 48  # characters of a line in a legend; a longer one would leave no room for the curves
 POINTS = 200  # of a curve; one that has more is averaged over neighbours
 # Scalars of every iteration, in seconds: the first is the sum of the others. Evaluations are in none of them.
 SECONDS = {name: f"charts/seconds_{name}" for name in ("iteration", "collect", "update")}
@@ -398,7 +399,7 @@ def draw_metric(axis: Axes, name: str, agents: dict[str, list[RunLog]], over: st
         x, scores = align(curves)
         marker = "o" if len(x) == 1 else None  # a line of one point is not to be seen
         seeds = f"{len(runs)} seed{'s' * (len(runs) > 1)}"
-        axis.plot(x, iqm(scores), color=color, marker=marker, label=f"{textwrap.fill(label, 48)}, {seeds}")
+        axis.plot(x, iqm(scores), color=color, marker=marker, label=f"{textwrap.fill(label, LABEL_WIDTH)}, {seeds}")
         if len(runs) > 1:
             band = np.stack([interval(point) for point in scores], axis=-1)  # (2, P); one after the other saves memory
             axis.fill_between(x, *band, color=color, alpha=0.2, linewidth=0)
@@ -470,7 +471,8 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
     metrics = len(config.metrics) or 1
     across = min(len(tasks), 2) if metrics == 1 else 1  # tasks side by side
     down = math.ceil(len(tasks) / across)
-    legend = 0.22 * max(sum(len(textwrap.wrap(label, 48)) for label in agents) for agents in tasks.values())  # inches
+    lines = max(sum(len(textwrap.wrap(label, LABEL_WIDTH)) for label in agents) for agents in tasks.values())
+    legend = 0.22 * lines  # inches below the curves
     figure = Figure(figsize=(5.5 * across * metrics, (3.8 + legend) * down), layout="constrained")
     grid = figure.subplots(down, across * metrics, squeeze=False).reshape(-1, metrics)  # a task's pictures a row
     for axis in grid[len(tasks) :].flat:
