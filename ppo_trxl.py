@@ -5,7 +5,8 @@
 The agent gets one observation at a time. Every step leaves an item in the episodic memory: the inputs of the
 transformer's blocks. Each block of a later step attends to the items of the last --trxl-memory-length steps of the
 episode. Items are stored without gradient, as the weights of their rollout computed them; --trxl-memory-gradient
-computes those of the same segment again, with gradient, and --refresh-memory those of the rollout before each epoch.
+computes those of the same segment again, with gradient, and --refresh-memory those of the rollout before each epoch but
+the first.
 
 A window is never gathered for every query. While acting, each item is projected to its key and value once, into a cache
 that is computed again after each update. For the update, the steps of an environment's rollout and the window before
