@@ -247,6 +247,7 @@ class RunLog:
     path: str
     args: dict[str, str]  # the script's name and its arguments, as text
     curves: dict[str, tuple[np.ndarray, np.ndarray]]
+    machine: str = "not recorded"  # what trained it, if a file of `write_run` names it
 
     def seconds(self, name: str) -> np.ndarray:
         """Return the seconds (I,) of each iteration: a name in SECONDS."""
@@ -269,7 +270,8 @@ def read_run(path: str) -> RunLog:
             with gzip.open(path, "rt") as file:
                 saved = json.load(file)
             curves = {name: (np.cumsum(steps), np.array(values)) for name, (steps, values) in saved["curves"].items()}
-            return RunLog(path, with_defaults(saved["args"]), curves)
+            machine = saved.get("machine", RunLog.machine)
+            return RunLog(path, with_defaults(saved["args"]), curves, machine)
         except (KeyError, TypeError, AttributeError, ValueError, EOFError, zlib.error, gzip.BadGzipFile):
             raise NoCurvesError(f"{path} holds no curves of a training run") from None
     if not os.path.isdir(path):
@@ -336,8 +338,9 @@ def with_defaults(given: dict[str, str]) -> dict[str, str]:
 def write_run(run: RunLog, path: str) -> None:
     """Write what tables and pictures need, in a few KB; `read_run` reads it as it reads the run's folder.
 
-    That is the arguments, the evaluations in the family's own metric, return, length and falls, the seconds of each
-    iteration, and the norm of the gradient, averaged to POINTS. Steps are kept as differences, which compress better.
+    That is the machine, the arguments, the evaluations in the family's own metric, return, length and falls, the
+    seconds of each iteration, and the norm of the gradient, averaged to POINTS. Steps are kept as differences, which
+    compress better.
     """
     names = [f"eval/{name}" for name in (own_metric(run.args["env_id"]), "return", "length", "num_fails")]
     kept = {name: run.curves[name] for name in (*dict.fromkeys(names), *SECONDS.values()) if name in run.curves}
@@ -350,7 +353,7 @@ def write_run(run: RunLog, path: str) -> None:
         for name, (steps, values) in kept.items()
     }
     with gzip.open(f"{path}.part", "wt") as file:
-        json.dump({"args": run.args, "curves": curves}, file, separators=(",", ":"))
+        json.dump({"machine": run.machine, "args": run.args, "curves": curves}, file, separators=(",", ":"))
     os.replace(f"{path}.part", path)  # a file that is there is complete
 
 

@@ -18,13 +18,15 @@ import importlib
 import json
 import math
 import os
+import platform
 import re
 import signal
 import subprocess
 import sys
 import zlib
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -271,7 +273,15 @@ def write_result(config: Training, plan: Plan) -> None:
             f"{plan}, has no {metric} at its end: an evaluation was cut short; give the agent more steps, as "
             f'"{plan.agent} --eval-max-steps 100000"'
         )
-    evaluate.write_run(run, f"{config.results}/{Path(run.path).name}.json.gz")
+    evaluate.write_run(replace(run, machine=machine()), f"{config.results}/{Path(run.path).name}.json.gz")
+
+
+def machine() -> str:
+    """Name this machine's processor and number of cores, and the version of PyTorch."""
+    cpuinfo = Path("/proc/cpuinfo")  # of Linux; elsewhere, Python knows the name
+    models = re.findall(r"^model name\s*: (.*)", cpuinfo.read_text() if cpuinfo.exists() else "", re.MULTILINE)
+    processor = models[0] if models else platform.processor() or platform.machine()
+    return f"{processor}, {os.cpu_count()} cores, PyTorch {version('torch')}"
 
 
 def train_missing(config: Training, wanted: list[Plan]) -> None:
@@ -325,7 +335,7 @@ def row(agent: str, runs: list[evaluate.RunLog], metric: str, best: float) -> st
 
 
 def report(task: Task, steps: int, runs: dict[str, list[evaluate.RunLog]]) -> None:
-    """Print a task's table: the runs of each agent, one a seed."""
+    """Print a task's table: the runs of each agent, one a seed, and on which machines they were trained."""
     curves = [evaluate.align([run.curves[f"eval/{task.metric}"] for run in each]) for each in runs.values()]
     best = max(evaluate.iqm(scores[-1]) for _, scores in curves)
     print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {steps:,} steps\n")
@@ -333,6 +343,8 @@ def report(task: Task, steps: int, runs: dict[str, list[evaluate.RunLog]]) -> No
     print("|---|---:|---:|---:|---|---:|---:|---:|---:|")
     for agent, each in runs.items():
         print(row(agent, each, task.metric, float(best)))
+    machines = dict.fromkeys(run.machine for each in runs.values() for run in each)
+    print(f"\nMachines: {'; '.join(machines)}")
 
 
 def main(config: Config) -> None:

@@ -1,6 +1,7 @@
 """benchmarks/learning.py: its command lines, and which runs it need not train again."""
 
 import fcntl
+import os
 import shutil
 import signal
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 import learning
 import numpy as np
 import pytest
+import torch
 
 import evaluate
 import ppo_gru
@@ -77,6 +79,8 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     assert (learning.is_complete(whole), whole.path) == (True, str(config.folder / run.folder))
     kept = learning.result_of(config, plan)
     assert kept.args == whole.args
+    assert (kept.machine, whole.machine) == (learning.machine(), "not recorded")
+    assert f" {os.cpu_count()} cores, PyTorch {torch.__version__}" in kept.machine
     for name in ("eval/commands_completed", "eval/return", "eval/length", "charts/seconds_iteration"):
         for one, other in zip(kept.curves[name], whole.curves[name], strict=True):
             assert one == pytest.approx(other, rel=1e-3)
@@ -87,6 +91,7 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     told = capsys.readouterr().out
     assert "trained" not in told
     assert f"| {agent} | 1 |" in told
+    assert f"\nMachines: {kept.machine}\n" in told
     assert config.out.with_suffix(".png").stat().st_size > 10_000
 
 
