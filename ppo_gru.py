@@ -12,9 +12,9 @@ possibly with older weights; --refresh-memory recomputes it before each epoch bu
 Source: "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", called the thesis below.
 §5.2 is its section, (5.7) its equation; defaults are the "Final" column of its table 6.1.
 
-How to read: sections 1 to 6 from top to bottom are the algorithm. The memory is section 4; the other sections would be
-the same with another one, but for its flags. What evaluates (7), what runs a training (8: run folder, files, command
-line) and what only makes it faster (9) may be skipped.
+How to read: sections 1 to 6 from top to bottom are the algorithm. The memory is section 4; with another one, sections
+2, 3 and 5 to 8 stay as they are. What evaluates (7), what runs a training (8: run folder, files, command line) and what
+only makes it faster (9) may be skipped.
 
 Shape letters: T steps of a rollout, N environments, A action branches, B samples of a minibatch, S sequences of a
 minibatch, L steps of the longest, I inputs and D width of the memory, P hidden vectors per environment, F features, G
@@ -47,7 +47,6 @@ import torch.nn.functional as F
 import tyro
 from torch import Tensor, nn
 from torch.distributions import Categorical
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torch.nn.utils.rnn import pad_sequence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -179,7 +178,7 @@ class Args:
     vf_coef: NonNegativeFloat = 0.5
     """weight of the value loss"""
     max_grad_norm: PositiveFloat = 0.25
-    """the gradient is scaled down to this norm"""
+    """a gradient with a larger norm is scaled down to this one"""
     target_kl: PositiveFloat | None = None
     """end an iteration's update at the first minibatch whose KL divergence from the policy that acted exceeds this"""
     init_lr: UnitInterval = 2.75e-4
@@ -191,15 +190,15 @@ class Args:
     final_ent_coef: NonNegativeFloat = 1.0e-6
     """weight of the entropy bonus from step --anneal-steps on"""
     anneal_steps: NonNegativeInt = 163_840_000
-    """steps over which both decay linearly (0: both keep their initial values)"""
+    """steps over which learning rate and entropy bonus decay linearly (0: they keep their initial values)"""
     reconstruction_coef: NonNegativeFloat = 0.0
     """weight of the loss of reconstructing the image from the memory's output (0: off; the thesis has 0.1)"""
     reconstruction_detach: bool = False
-    """reconstruct it without teaching the agent: a probe of what the memory's output tells of the image"""
+    """reconstruct the image without teaching the agent: a probe of what the memory's output tells of it"""
     ground_truth_coef: NonNegativeFloat = 0.0
     """weight of the loss of estimating the environment's ground truth (0: off; the thesis has 0.1)"""
     ground_truth_detach: bool = False
-    """estimate it without teaching the agent: a probe of what its memory holds"""
+    """estimate the ground truth without teaching the agent: a probe of what its memory holds"""
     embedding: bool = True
     """embed the encoded observation in the memory's width; without, the memory takes it as it is (a transformer only if
     --trxl-dim is its width)"""
@@ -551,6 +550,8 @@ class Decoder(nn.Sequential):
 #   rewind                         go back to the rollout's first step, to store all of it again (--refresh-memory)
 #   logs                           numbers for TensorBoard
 #   not_saved                      fields of the state that no checkpoint holds
+#   width                          D, the width of what comes out
+# Section 1 has what is known before it is made: its flags, NETWORK_FLAGS, memory_width and longest_piece.
 class MemoryState(NamedTuple):
     """What N environments remember. `t` and `hidden` are replaced step by step, `stored` is written in place."""
 
@@ -595,7 +596,7 @@ class Memory(nn.Module):
     def step(self, x: Tensor, state: MemoryState) -> tuple[Tensor, MemoryState]:
         """Take one step of all environments: x (N, I) to (N, D), and the state after it. Stores the state before it.
 
-        Who only wants a value keeps the given state and takes the step again: that overwrites row t of what is stored.
+        To get a value only, discard the returned state: the next call overwrites row t of what is stored.
         """
         state.stored[state.t] = state.hidden
         if self.kind == "none":
@@ -719,7 +720,7 @@ class Rollout:
     ground_truth: Tensor | None  # (T, N, G), if it is estimated
     next_obs: dict[str, np.ndarray]  # each (N, ...)
     next_ground_truth: np.ndarray | None  # (N, G)
-    memory_state: MemoryState  # of these steps, and before the next one
+    memory_state: MemoryState  # what the update needs of these steps, and what the next one begins with
     advantages: Tensor | None = None  # (T, N)
     returns: Tensor | None = None  # (T, N)
 
@@ -882,8 +883,8 @@ def update(
     observations = UniqueObservations(rollout.obs, agent)
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
     # A detached head is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
-    heads = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
-    probes = [[*head.parameters()] for head, detached in heads if head is not None and detached]
+    auxiliary = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
+    probes = [[*module.parameters()] for module, detached in auxiliary if module is not None and detached]
     apart = {parameter for probe in probes for parameter in probe}
     parameters = [parameter for parameter in agent.parameters() if parameter not in apart]
     logs = []
@@ -904,7 +905,7 @@ def update(
         logs.append(log)
 
     losses = mean_log(logs)
-    # Before the first gradient step the weights are those that acted, and so must be every probability.
+    # Before the first gradient step the weights are those that acted, so every ratio has to be 1.
     losses["ratio_error"] = logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
     padding = 1 - float(pieces.length.float().mean() / pieces.length.max())  # if all were padded to the longest
@@ -1004,7 +1005,8 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
 def level_scores(args: Args, run: "Run") -> dict[str, Tensor]:
     """Return an evaluation's metrics by name, (--eval-levels, --eval-repeats) float64: every episode on every level.
 
-    Training goes on as if there had been none. What only an episode's end tells is left out if an episode was cut
+    Training goes on as if there had been none, unless an environment of another package takes random numbers from
+    NumPy's or Python's global generator. What only an episode's end tells is left out if an episode was cut
     short: the best ones would be missing. An episode that is too long for the memory ends the evaluation with a warning
     and without metrics.
     """
@@ -1125,7 +1127,8 @@ def make_agent(envs: gym.vector.VectorEnv, infos: dict, args: Args, device: torc
 
 
 def setup(args: Args) -> Run:
-    """Check the arguments and make everything, files last: bad input raises before anything is written.
+    """Check the arguments and make everything, files last: bad input raises before anything is written, except for a
+    checkpoint that does not fit.
 
     Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
     """
@@ -1329,20 +1332,23 @@ def average_gradients(agent: Agent, num_steps: int) -> None:
     if not dist.is_initialized():
         return
     gradients = [parameter.grad for parameter in agent.parameters() if parameter.grad is not None]
-    flat = parameters_to_vector([*gradients, gradients[0].new_ones(1)]) * num_steps
+    flat = torch.cat([*(gradient.flatten() for gradient in gradients), gradients[0].new_ones(1)]) * num_steps
     with lost_process():
         dist.all_reduce(flat)
-    vector_to_parameters(flat[:-1] / flat[-1], gradients)
+    means = (flat[:-1] / flat[-1]).split([gradient.numel() for gradient in gradients])
+    for gradient, mean in zip(gradients, means, strict=True):
+        gradient.copy_(mean.view_as(gradient))  # in place: its memory layout has to stay that of the weight
 
 
 def combine_processes(parts: list[tuple[dict, dict, int]]) -> tuple[dict[str, float], dict[str, list[float]], bool]:
     """Combine what the processes found: the means of their logs, all episodes, and whether any got a signal.
 
-    The ratio's error is a maximum over samples, and so over processes.
+    Maxima over samples are maxima over processes.
     """
     logs, episodes, signals = zip(*parts, strict=True)
     found = {name: [each[name] for each in logs if name in each] for name in logs[0]}
-    logs = {name: max(v) if name == "losses/ratio_error" else float(np.mean(v)) for name, v in found.items()}
+    maxima = ("losses/ratio_error", "charts/memory_window")
+    logs = {name: max(values) if name in maxima else float(np.mean(values)) for name, values in found.items()}
     joined = defaultdict(list)
     for each in episodes:
         for name, values in each.items():
@@ -1570,8 +1576,9 @@ def stop_on_signals(run: Run) -> None:
     def stop(number: int, _: Any) -> None:
         if run.received_signal and number == signal.SIGINT and not dist.is_initialized():
             raise KeyboardInterrupt
-        if not run.received_signal and run.bar is not None:  # by no print, which might be at work already
-            os.write(2, b"\nstopping at the end of this iteration; Ctrl-C stops at once, without a checkpoint\n")
+        if not run.received_signal and run.bar is not None:
+            hint = "" if dist.is_initialized() else "; Ctrl-C stops at once, without a checkpoint"
+            os.write(2, f"\nstopping at the end of this iteration{hint}\n".encode())  # print might be at work already
         run.received_signal = number
 
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -1590,7 +1597,8 @@ def close(run: Run) -> None:
 def run_to_end(args: Args, run: Run) -> Path:
     """Train until it is done or stopped; return the run folder. Raises what `train` and `write_file` raise.
 
-    With --save-model, what was learned is kept, unless the training diverged or the disk is full.
+    With --save-model, what was learned is kept, unless the training diverged, a file could not be written or another
+    process ended.
     """
     save_model = args.save_model
     try:
@@ -1682,7 +1690,8 @@ def compile_now(agent: Agent, args: Args, obs: dict[str, np.ndarray]) -> None:
     chunk = {name: part[:1].expand(CHUNK, *part.shape[1:]) for name, part in as_tensors(obs, device).items()}
     try:
         with autocast(args, device):
-            agent.heads(agent.encoder(chunk))
+            features = agent.encoder(chunk)
+            agent.heads(features.new_zeros(len(features), agent.memory.width))
     except Exception as error:  # whatever the compiler raises
         raise ValueError(f"--compile: {error}; install a C++ compiler (g++), or leave --compile out") from None
 

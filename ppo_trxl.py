@@ -11,15 +11,15 @@ the first.
 A window is never gathered for every query. While acting, each item is projected to its key and value once, into a cache
 that is computed again after each update. For the update, the steps of an environment's rollout and the window before
 them form a timeline, which is cut into segments of --trxl-segment-length steps. The queries of a segment attend to its
-own items and to the window before it, which are projected once a segment, under one band mask: each query sees the
+own items and to the window before it, which are projected once per segment, under one band mask: each query sees the
 earlier steps of its own episode, as far as the window reaches.
 
 Source: "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", called the thesis below.
 §5.3 is its section, (5.7) its equation; defaults are the "Final" column of its table 6.1.
 
-How to read: sections 1 to 6 from top to bottom are the algorithm. The memory is section 4; the other sections would be
-the same with another one, but for its flags. What evaluates (7), what runs a training (8: run folder, files, command
-line) and what only makes it faster (9) may be skipped.
+How to read: sections 1 to 6 from top to bottom are the algorithm. The memory is section 4; with another one, sections
+2, 3 and 5 to 8 stay as they are. What evaluates (7), what runs a training (8: run folder, files, command line) and what
+only makes it faster (9) may be skipped.
 
 Shape letters: T steps of a rollout, N environments, A action branches, B samples of a minibatch, S segments of a
 minibatch, L steps of the longest, W window, M items that a segment looks at, K blocks, H heads, I inputs and D width of
@@ -52,7 +52,6 @@ import torch.nn.functional as F
 import tyro
 from torch import Tensor, nn
 from torch.distributions import Categorical
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torch.nn.utils.rnn import pad_sequence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -184,7 +183,7 @@ class Args:
     vf_coef: NonNegativeFloat = 0.5
     """weight of the value loss"""
     max_grad_norm: PositiveFloat = 0.25
-    """the gradient is scaled down to this norm"""
+    """a gradient with a larger norm is scaled down to this one"""
     target_kl: PositiveFloat | None = None
     """end an iteration's update at the first minibatch whose KL divergence from the policy that acted exceeds this"""
     init_lr: UnitInterval = 2.75e-4
@@ -196,15 +195,15 @@ class Args:
     final_ent_coef: NonNegativeFloat = 1.0e-6
     """weight of the entropy bonus from step --anneal-steps on"""
     anneal_steps: NonNegativeInt = 163_840_000
-    """steps over which both decay linearly (0: both keep their initial values)"""
+    """steps over which learning rate and entropy bonus decay linearly (0: they keep their initial values)"""
     reconstruction_coef: NonNegativeFloat = 0.0
     """weight of the loss of reconstructing the image from the memory's output (0: off; the thesis has 0.1)"""
     reconstruction_detach: bool = False
-    """reconstruct it without teaching the agent: a probe of what the memory's output tells of the image"""
+    """reconstruct the image without teaching the agent: a probe of what the memory's output tells of it"""
     ground_truth_coef: NonNegativeFloat = 0.0
     """weight of the loss of estimating the environment's ground truth (0: off; the thesis has 0.1)"""
     ground_truth_detach: bool = False
-    """estimate it without teaching the agent: a probe of what its memory holds"""
+    """estimate the ground truth without teaching the agent: a probe of what its memory holds"""
     embedding: bool = True
     """embed the encoded observation in the memory's width; without, the memory takes it as it is (a transformer only if
     --trxl-dim is its width)"""
@@ -237,7 +236,7 @@ class Args:
     trxl_pe_length: PositiveInt = 2048
     """longest episode that a learned encoding is made for"""
     trxl_segment_length: PositiveInt = 128
-    """steps of one environment that the update attends from at once, and the pieces that minibatches are made of"""
+    """steps of one environment that the update computes at once; minibatches are made of such segments"""
     trxl_memory_gradient: bool = False
     """teach earlier steps of a segment what to leave for later ones: attend to their present inputs, with gradient"""
     trxl_init: Literal["xavier", "orthogonal", "kaiming", "tfixup"] = "xavier"
@@ -588,10 +587,12 @@ class Decoder(nn.Sequential):
 #   rewind                         go back to the rollout's first step, to store all of it again (--refresh-memory)
 #   logs                           numbers for TensorBoard
 #   not_saved                      fields of the state that no checkpoint holds
+#   width                          D, the width of what comes out
+# Section 1 has what is known before it is made: its flags, NETWORK_FLAGS, memory_width and longest_piece.
 def visible(age: Tensor, episode_step: Tensor, window: int) -> Tensor:
     """Return whether a query at this step of its episode sees the item that was stored `age` steps before it.
 
-    Nothing else decides what is seen: not the rollout, not the value that bootstraps, not the update.
+    The rollout, the bootstrap value and the update all ask this function; nothing else decides what is seen.
     """
     return (age >= 1) & (age <= episode_step) & (age <= window)
 
@@ -651,9 +652,10 @@ class Attention(nn.Module):
 
 
 class Gate(nn.Module):
-    """The gated recurrent unit in place of a residual connection, for GTrXL (§2.4.7; Parisotto et al., 2020).
+    """A gated recurrent unit in place of a residual connection: GTrXL (Parisotto et al., 2020).
 
-    The stream x is its hidden state, and the output y of a layer its input. A bias above 0 mostly keeps x at first.
+    The stream x is its hidden state, and the output y of a layer its input; §2.4.7 has them the other way round, see
+    docs/memory.md. A bias above 0 mostly keeps x at first.
     """
 
     def __init__(self, width: int, bias: float):
@@ -785,7 +787,7 @@ class Memory(nn.Module):
         state = state._replace(now=self.window)
         rows, _, seen = self.look_back(state)
         seen = seen[:, 0].T  # (M, N)
-        items = state.items[rows].masked_fill(~seen[..., None, None], 0.0)  # (M, N, K, D)
+        items = state.items[rows].masked_fill(~seen[..., None, None], 0.0)  # (M, N, K or K + 1, D)
         position = self.position(state.item_steps[rows].to(seen.device).where(seen, 0), items.dtype)  # (M, N, D)
         for k, block in enumerate(self.blocks):
             keys, values = block.keys_values(items[:, :, k] + position)
@@ -813,8 +815,8 @@ class Memory(nn.Module):
             state.items[state.now, :, k] = x[:, 0].detach()
             key, value = block.keys_values(x + position)  # (N, 1, D) each
             state.keys[k][:, state.now], state.values[k][:, state.now] = key[:, 0], value[:, 0]
-            window = state.keys[k][:, rows], state.values[k][:, rows]  # (N, M, D) each
-            x = block(x, in_query if k == 0 else 0.0, window, age, seen)
+            keys_values = state.keys[k][:, rows], state.values[k][:, rows]  # (N, M, D) each
+            x = block(x, in_query if k == 0 else 0.0, keys_values, age, seen)
         if self.query_output is not None:
             state.items[state.now, :, -1] = x[:, 0].detach()
         return x[:, 0], state._replace(now=state.now + 1, episode_step=state.episode_step + 1)
@@ -834,14 +836,14 @@ class Memory(nn.Module):
         """Forget where an episode ended: done (N,), on the CPU."""
         if not done.any():
             return state
-        rows, _, _ = self.look_back(state)
+        rows = slice(state.now - self.reach(state.episode_step), state.now)
         for cache in (state.keys, state.values):
             # Nothing sees these any more. As zeros, not even a NaN among them could pass through a weight of zero.
             cache[:, done.nonzero().to(cache.device), rows] = 0.0
         return state._replace(episode_step=state.episode_step.masked_fill(done, 0))
 
     def cut(self, done: Tensor) -> Pieces:
-        """Cut a rollout into segments, also where an episode ends in one: done (T, N) is for the mask alone."""
+        """Cut a rollout into segments of the same length: done (T, N) does not matter, `visible` parts episodes."""
         begins = torch.arange(len(done)) % self.segment_length == 0
         return Pieces.beginning(begins[:, None].expand_as(done))
 
@@ -870,7 +872,7 @@ class Memory(nn.Module):
         item_columns = torch.arange(-before, len(columns) - 1)  # (M,)
         rows = (row + item_columns).clamp(max=last_row)  # (S, M)
         item_steps = state.item_steps[rows, env].to(device)  # (S, M)
-        items = state.items[rows.to(device), env.to(device)]  # (S, M, K, D)
+        items = state.items[rows.to(device), env.to(device)]  # (S, M, K or K + 1, D)
 
         age = (columns[:, None] - item_columns).to(device)  # (L, M)
         episode_step = episode_step.to(device)
@@ -888,11 +890,13 @@ class Memory(nn.Module):
             x = block(x, in_query if k == 0 else 0.0, keys_values, age, seen)
         return pieces.unpad(x)
 
+    def encode_step(self, episode_step: Tensor, dtype: torch.dtype) -> Tensor:
+        """Encode steps of episodes, of any shape, to (..., D): by the learned table, or as sines and cosines."""
+        return self.table[episode_step] if self.encoding == "learned" else sinusoid(episode_step, self.width).to(dtype)
+
     def position(self, episode_step: Tensor, dtype: torch.dtype) -> Tensor | float:
-        """Return the encoding (..., D) of items that were stored at these steps of their episodes."""
-        if self.encoding == "learned":
-            return self.table[episode_step]
-        return sinusoid(episode_step, self.width).to(dtype) if self.encoding == "absolute" else 0.0
+        """Return what is added to items (..., D) that were stored at these steps of their episodes."""
+        return self.encode_step(episode_step, dtype) if self.encoding in ("absolute", "learned") else 0.0
 
     def in_query(self, episode_step: Tensor, items_before: Tensor, dtype: torch.dtype) -> Tensor | float:
         """Return what is added to the first block's query (S, L, D) at these steps (S, L) of their episodes (§7.1.3).
@@ -900,10 +904,7 @@ class Memory(nn.Module):
         With --trxl-query-position the encoding of the step; with --trxl-query-output a projection of the last block's
         output of the step before, which is the last part of that step's items (S, L, K + 1, D).
         """
-        added = 0.0
-        if self.query_position:
-            learned = self.encoding == "learned"
-            added = self.table[episode_step] if learned else sinusoid(episode_step, self.width).to(dtype)
+        added = self.encode_step(episode_step, dtype) if self.query_position else 0.0
         if self.query_output is not None:
             output_before = items_before[..., -1, :].masked_fill(episode_step[..., None] == 0, 0.0)
             added = added + self.query_output(output_before)
@@ -995,7 +996,7 @@ class Rollout:
     ground_truth: Tensor | None  # (T, N, G), if it is estimated
     next_obs: dict[str, np.ndarray]  # each (N, ...)
     next_ground_truth: np.ndarray | None  # (N, G)
-    memory_state: MemoryState  # of these steps, and before the next one
+    memory_state: MemoryState  # what the update needs of these steps, and what the next one begins with
     advantages: Tensor | None = None  # (T, N)
     returns: Tensor | None = None  # (T, N)
 
@@ -1158,8 +1159,8 @@ def update(
     observations = UniqueObservations(rollout.obs, agent)
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
     # A detached head is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
-    heads = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
-    probes = [[*head.parameters()] for head, detached in heads if head is not None and detached]
+    auxiliary = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
+    probes = [[*module.parameters()] for module, detached in auxiliary if module is not None and detached]
     apart = {parameter for probe in probes for parameter in probe}
     parameters = [parameter for parameter in agent.parameters() if parameter not in apart]
     logs = []
@@ -1180,7 +1181,7 @@ def update(
         logs.append(log)
 
     losses = mean_log(logs)
-    # Before the first gradient step the weights are those that acted, and so must be every probability.
+    # Before the first gradient step the weights are those that acted, so every ratio has to be 1.
     losses["ratio_error"] = logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
     padding = 1 - float(pieces.length.float().mean() / pieces.length.max())  # if all were padded to the longest
@@ -1280,7 +1281,8 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
 def level_scores(args: Args, run: "Run") -> dict[str, Tensor]:
     """Return an evaluation's metrics by name, (--eval-levels, --eval-repeats) float64: every episode on every level.
 
-    Training goes on as if there had been none. What only an episode's end tells is left out if an episode was cut
+    Training goes on as if there had been none, unless an environment of another package takes random numbers from
+    NumPy's or Python's global generator. What only an episode's end tells is left out if an episode was cut
     short: the best ones would be missing. An episode that is too long for the memory ends the evaluation with a warning
     and without metrics.
     """
@@ -1401,7 +1403,8 @@ def make_agent(envs: gym.vector.VectorEnv, infos: dict, args: Args, device: torc
 
 
 def setup(args: Args) -> Run:
-    """Check the arguments and make everything, files last: bad input raises before anything is written.
+    """Check the arguments and make everything, files last: bad input raises before anything is written, except for a
+    checkpoint that does not fit.
 
     Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
     """
@@ -1605,20 +1608,23 @@ def average_gradients(agent: Agent, num_steps: int) -> None:
     if not dist.is_initialized():
         return
     gradients = [parameter.grad for parameter in agent.parameters() if parameter.grad is not None]
-    flat = parameters_to_vector([*gradients, gradients[0].new_ones(1)]) * num_steps
+    flat = torch.cat([*(gradient.flatten() for gradient in gradients), gradients[0].new_ones(1)]) * num_steps
     with lost_process():
         dist.all_reduce(flat)
-    vector_to_parameters(flat[:-1] / flat[-1], gradients)
+    means = (flat[:-1] / flat[-1]).split([gradient.numel() for gradient in gradients])
+    for gradient, mean in zip(gradients, means, strict=True):
+        gradient.copy_(mean.view_as(gradient))  # in place: its memory layout has to stay that of the weight
 
 
 def combine_processes(parts: list[tuple[dict, dict, int]]) -> tuple[dict[str, float], dict[str, list[float]], bool]:
     """Combine what the processes found: the means of their logs, all episodes, and whether any got a signal.
 
-    The ratio's error is a maximum over samples, and so over processes.
+    Maxima over samples are maxima over processes.
     """
     logs, episodes, signals = zip(*parts, strict=True)
     found = {name: [each[name] for each in logs if name in each] for name in logs[0]}
-    logs = {name: max(v) if name == "losses/ratio_error" else float(np.mean(v)) for name, v in found.items()}
+    maxima = ("losses/ratio_error", "charts/memory_window")
+    logs = {name: max(values) if name in maxima else float(np.mean(values)) for name, values in found.items()}
     joined = defaultdict(list)
     for each in episodes:
         for name, values in each.items():
@@ -1846,8 +1852,9 @@ def stop_on_signals(run: Run) -> None:
     def stop(number: int, _: Any) -> None:
         if run.received_signal and number == signal.SIGINT and not dist.is_initialized():
             raise KeyboardInterrupt
-        if not run.received_signal and run.bar is not None:  # by no print, which might be at work already
-            os.write(2, b"\nstopping at the end of this iteration; Ctrl-C stops at once, without a checkpoint\n")
+        if not run.received_signal and run.bar is not None:
+            hint = "" if dist.is_initialized() else "; Ctrl-C stops at once, without a checkpoint"
+            os.write(2, f"\nstopping at the end of this iteration{hint}\n".encode())  # print might be at work already
         run.received_signal = number
 
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -1866,7 +1873,8 @@ def close(run: Run) -> None:
 def run_to_end(args: Args, run: Run) -> Path:
     """Train until it is done or stopped; return the run folder. Raises what `train` and `write_file` raise.
 
-    With --save-model, what was learned is kept, unless the training diverged or the disk is full.
+    With --save-model, what was learned is kept, unless the training diverged, a file could not be written or another
+    process ended.
     """
     save_model = args.save_model
     try:
@@ -1958,7 +1966,8 @@ def compile_now(agent: Agent, args: Args, obs: dict[str, np.ndarray]) -> None:
     chunk = {name: part[:1].expand(CHUNK, *part.shape[1:]) for name, part in as_tensors(obs, device).items()}
     try:
         with autocast(args, device):
-            agent.heads(agent.encoder(chunk))
+            features = agent.encoder(chunk)
+            agent.heads(features.new_zeros(len(features), agent.memory.width))
     except Exception as error:  # whatever the compiler raises
         raise ValueError(f"--compile: {error}; install a C++ compiler (g++), or leave --compile out") from None
 

@@ -90,6 +90,12 @@ def test_ratio_is_nearly_one_when_compiled(played, script):
     torch.testing.assert_close(run.agent.encoder({"observation": x}), plain.encoder({"observation": x}))
 
 
+def test_what_is_compiled_runs_first_without_an_embedding_too(played):
+    """Of 3,136 features, the memory makes as many as it is wide."""
+    args, run, *_ = played(env_id="MortarMayhem-Grid-v0", embedding=False)
+    ppo_gru.compile_now(run.agent, args, run.rollout.next_obs)  # raises what fails
+
+
 @each_memory(WITH_MEMORY)
 def test_ratio_error_sees_a_broken_memory(played, memory):
     """Guards the guard: with what the memory stored lost, the ratios are off."""

@@ -54,14 +54,15 @@ def flags_of(script, **changes):
     return [*WIDTH[script].split(), "--no-cuda", *(part for k, v in flags.items() for part in (f"--{k}", str(v)))]
 
 
+@pytest.mark.parametrize("obs_type", ["vector", "pixels"])
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_two_processes_make_the_update_of_one(tiny, script):
+def test_two_processes_make_the_update_of_one(tiny, script, obs_type):
     """Given the same rollouts, each half of the lanes; one gradient step.
 
     By plain gradient descent: AdamW divides a gradient by its size, also where that is no more than rounding.
     """
     changes = {"num_envs": 32, "num_minibatches": 1, "update_epochs": 1, "num_steps": 16}
-    args = tiny(script, **GRID, **changes, total_timesteps=512)
+    args = tiny(script, **GRID | {"obs_type": obs_type}, **changes, total_timesteps=512)
     run = script.setup(args)
     for _ in range(2):
         script.collect(run.agent, run.envs, run.rollout, args)
@@ -84,9 +85,10 @@ def test_two_processes_make_the_update_of_one(tiny, script):
     assert logs["losses/grad_norm"] == pytest.approx(alone["losses/grad_norm"], rel=1e-5)
 
 
-def test_gradients_are_means_over_steps(monkeypatch, tiny):
-    """Of 3 steps here and 1 step there, not of two halves."""
-    run = ppo_gru.setup(tiny(**GRID))
+@pytest.mark.parametrize("obs_type", ["vector", "pixels"])
+def test_gradients_are_means_over_steps(monkeypatch, tiny, obs_type):
+    """Of 3 steps here and 1 step there, not of two halves; in memory as the weights, which fused AdamW relies on."""
+    run = ppo_gru.setup(tiny(**GRID | {"obs_type": obs_type}))
     for parameter in run.agent.parameters():
         parameter.grad = torch.full_like(parameter, 4.0)
     monkeypatch.setattr(ppo_gru.dist, "is_initialized", lambda: True)
@@ -96,6 +98,13 @@ def test_gradients_are_means_over_steps(monkeypatch, tiny):
     for parameter in run.agent.parameters():
         assert (parameter.grad == (3 * 4.0 + 8.0) / 4).all()
         assert parameter.grad.shape == parameter.shape
+        assert parameter.grad.stride() == parameter.stride()
+
+
+def test_a_maximum_is_the_maximum_of_all_processes():
+    logs = [{"charts/memory_window": 40.0, "losses/loss": 1.0}, {"charts/memory_window": 100.0, "losses/loss": 2.0}]
+    combined, *_ = ppo_trxl.combine_processes([(each, {}, 0) for each in logs])
+    assert combined == {"charts/memory_window": 100.0, "losses/loss": 1.5}
 
 
 def test_a_resumed_run_is_the_unstopped_one(curves):
