@@ -181,8 +181,6 @@ class Args:
     """a gradient with a larger norm is scaled down to this one"""
     target_kl: PositiveFloat | None = None
     """end an iteration's update at the first minibatch whose KL divergence from the policy that acted exceeds this"""
-    reset_momentum: bool = False
-    """begin each update without the momentum that the optimizer has from the one before (Asadi et al., 2023)"""
     init_lr: UnitInterval = 2.75e-4
     """learning rate at the first step"""
     final_lr: UnitInterval = 1.0e-5
@@ -889,9 +887,6 @@ def update(
     probes = [[*module.parameters()] for module, detached in auxiliary if module is not None and detached]
     apart = {parameter for probe in probes for parameter in probe}
     parameters = [parameter for parameter in agent.parameters() if parameter not in apart]
-    if args.reset_momentum:  # it may point to where --target-kl stopped the update before, and would push on
-        for moments in optimizer.state.values():
-            moments["exp_avg"].zero_()
     logs = []
     for minibatch in epochs(agent, rollout, pieces, args):
         loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)

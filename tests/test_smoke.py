@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torch.nn.utils import parameters_to_vector
 
 import ppo_gru
 import ppo_trxl
@@ -254,20 +253,6 @@ def test_target_kl_ends_the_update_at_the_first_minibatch_beyond_it(played, monk
         assert len(steps) == len(divergences) - 1 < 5 * args.num_minibatches
         assert divergences[-1] > target_kl >= max(divergences[:-1])
     assert logs["charts/gradient_steps"] == len(steps) > 0
-
-
-@pytest.mark.parametrize("script", SCRIPTS)
-@pytest.mark.parametrize("reset", [False, True])
-def test_reset_momentum_forgets_the_update_before(played, script, reset):
-    """After an update with gradients, one without any: momentum alone would move the weights."""
-    args, run, *_ = played(script=script, env_id="CueRecall-v0", vf_coef=0.0, reset_momentum=reset)
-    optimizer = torch.optim.Adam(run.agent.parameters(), lr=0.01)
-    run.rollout.advantages.normal_()
-    script.update(run.agent, optimizer, run.rollout, 0.0, args)
-    before = parameters_to_vector(run.agent.parameters()).detach()
-    run.rollout.advantages.zero_()
-    script.update(run.agent, optimizer, run.rollout, 0.0, args)
-    assert before.equal(parameters_to_vector(run.agent.parameters())) == reset
 
 
 def test_logged_divergences(played):
