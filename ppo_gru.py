@@ -1127,10 +1127,10 @@ def make_agent(envs: gym.vector.VectorEnv, infos: dict, args: Args, device: torc
 
 
 def setup(args: Args) -> Run:
-    """Check the arguments and make everything, files last: bad input raises before anything is written, except for a
-    checkpoint that does not fit.
+    """Check the arguments and make everything, files last.
 
-    Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
+    Bad input raises before anything is written, but for a checkpoint that does not fit. Raises ValueError, OSError,
+    ImportError or gymnasium.error.Error, each with one line for the user.
     """
     if dist.is_torchelastic_launched() and not dist.is_initialized():  # by torchrun
         dist.init_process_group(timeout=timedelta(days=1))  # the others wait while the first one evaluates
