@@ -273,10 +273,10 @@ def adapt_lr(scale: float, share: float) -> float:
     """Return what to multiply the next learning rate by, from the last such scale and the share of steps taken.
 
     After an update that a limit to the KL divergence ended early, the scale falls by the share of its gradient steps
-    that were taken, at most to half; a whole update raises it by a tenth, up to 1. (The penalty of Schulman et al.,
-    2017, section 4, follows the divergence in a similar way.)
+    that were taken, at most to half; a whole update raises it by 2 %, up to 1. (The penalty of Schulman et al., 2017,
+    section 4, follows the divergence in a similar way.)
     """
-    return scale * max(share, 0.5) if share < 1 else min(1.1 * scale, 1.0)
+    return scale * max(share, 0.5) if share < 1 else min(1.02 * scale, 1.0)
 
 
 def gae(

@@ -38,7 +38,7 @@ def test_anneal_decays_linearly_then_stays(step, expected):
 
 @pytest.mark.parametrize(
     ("scale", "share", "expected"),
-    [(1.0, 1.0, 1.0), (0.5, 1.0, 0.55), (0.95, 1.0, 1.0), (0.5, 0.75, 0.375), (0.5, 0.1, 0.25)],
+    [(1.0, 1.0, 1.0), (0.5, 1.0, 0.51), (0.99, 1.0, 1.0), (0.5, 0.75, 0.375), (0.5, 0.1, 0.25)],
 )
 def test_learning_rate_falls_with_the_share_of_steps_and_rises_slowly(scale, share, expected):
     assert adapt_lr(scale, share) == pytest.approx(expected)

@@ -240,7 +240,7 @@ def test_adaptive_learning_rate_follows_the_gradient_steps(tiny, scalars):
     assert min(shares) < max(shares) == 1.0, "updates that were ended, and whole ones"
     expected = [1e-3]
     for share in shares[:-1]:
-        expected.append(min(expected[-1] * (1.1 if share == 1.0 else max(share, 0.5)), 1e-3))
+        expected.append(min(expected[-1] * (1.02 if share == 1.0 else max(share, 0.5)), 1e-3))
     assert curves["charts/learning_rate"] == pytest.approx(expected)
 
 
