@@ -81,7 +81,7 @@ POINTS = 200  # of a curve; one that has more is averaged over neighbours
 # Scalars of every iteration, in seconds: the first is the sum of the others. Evaluations are in none of them.
 SECONDS = {name: f"charts/seconds_{name}" for name in ("iteration", "collect", "update")}
 # Scalars that tell how an iteration's update went.
-OF_UPDATES = ("losses/grad_norm", "losses/entropy", "charts/gradient_steps", "charts/learning_rate")
+UPDATE_CURVES = ("losses/grad_norm", "losses/entropy", "charts/gradient_steps", "charts/learning_rate")
 
 
 @dataclass
@@ -341,12 +341,12 @@ def write_run(run: RunLog, path: str) -> None:
     """Write what tables and pictures need, in a few KB; `read_run` reads it as it reads the run's folder.
 
     That is the machine, the arguments, the evaluations in the family's own metric, return, length and falls, the
-    seconds of each iteration, and the curves OF_UPDATES, averaged to POINTS. Steps are kept as differences, which
+    seconds of each iteration, and the curves UPDATE_CURVES, averaged to POINTS. Steps are kept as differences, which
     compress better.
     """
     names = [f"eval/{name}" for name in (own_metric(run.args["env_id"]), "return", "length", "num_fails")]
     kept = {name: run.curves[name] for name in (*dict.fromkeys(names), *SECONDS.values()) if name in run.curves}
-    for name in OF_UPDATES:
+    for name in UPDATE_CURVES:
         if name in run.curves:
             steps, values = align([run.curves[name]])  # (P,), (P, R, M, E) with R = M = E = 1
             kept[name] = steps, values[:, 0]

@@ -270,11 +270,10 @@ def anneal(step: int, initial: float, final: float, anneal_steps: int) -> float:
 
 
 def adapt_lr(scale: float, share: float) -> float:
-    """Return what to multiply the next learning rate by, from the last such scale and the share of steps taken.
+    """Return the learning rate's next scale, given the present one and the share of gradient steps that were taken.
 
-    After an update that a limit to the KL divergence ended early, the scale falls by the share of its gradient steps
-    that were taken, at most to half; a whole update raises it by 2 %, up to 1. (The penalty of Schulman et al., 2017,
-    section 4, follows the divergence in a similar way.)
+    After an update that --target-kl ended early, the scale is multiplied by that share, but by 0.5 at least; a whole
+    update raises it by 2 %, up to 1. (The penalty of Schulman et al., 2017, section 4, adapts in a similar way.)
     """
     return scale * max(share, 0.5) if share < 1 else min(1.02 * scale, 1.0)
 

@@ -81,7 +81,7 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     assert kept.args == whole.args
     assert (kept.machine, whole.machine) == (learning.machine(), "not recorded")
     assert f" {os.cpu_count()} cores, PyTorch {torch.__version__}" in kept.machine
-    names = ("eval/commands_completed", "eval/return", "eval/length", "charts/seconds_iteration", *evaluate.OF_UPDATES)
+    names = ("eval/commands_completed", "eval/return", "eval/length", "charts/seconds_iteration", *evaluate.UPDATE_CURVES)
     for name in names:
         for one, other in zip(kept.curves[name], whole.curves[name], strict=True):
             assert one == pytest.approx(other, rel=1e-3)
