@@ -19,12 +19,12 @@ import signal
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import learning
 import numpy as np
 import tyro
-from learning import TASKS, Task
 
 import evaluate
+import learning
+from learning import TASKS, Task
 
 MORTAR_MAYHEM, MYSTERY_PATH = TASKS["mortar-mayhem"], TASKS["mystery-path"]
 ENDLESS = replace(TASKS["endless-mortar-mayhem"], total_timesteps=3_000_000)

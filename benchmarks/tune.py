@@ -60,9 +60,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import tyro
-from learning import SMALL, TASKS, Task
 
 from evaluate import SCRIPTS
+from learning import SMALL, TASKS, Task
 from ppo_gru import as_flags, flag
 
 try:

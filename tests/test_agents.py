@@ -5,11 +5,11 @@ import shlex
 from dataclasses import asdict
 from pathlib import Path
 
-import learning
 import pytest
 import tyro
 
 import evaluate
+import learning
 
 AGENTS = Path(__file__).parents[1] / "agents"
 ROWS = re.findall(r"^\| `(\S+)` \| (\w+) \| ([\d.]+) \| `python benchmarks/learning.py (.+)` \|$",

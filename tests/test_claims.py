@@ -1,9 +1,10 @@
 """benchmarks/claims.py: its verdicts, and one claim from its trainings to its row."""
 
-import claims
-import learning
 import numpy as np
 import pytest
+
+import claims
+import learning
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,12 @@ import sys
 import time
 from pathlib import Path
 
-import learning
 import numpy as np
 import pytest
 import torch
 
 import evaluate
+import learning
 import ppo_gru
 
 
@@ -81,8 +81,8 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     assert kept.args == whole.args
     assert (kept.machine, whole.machine) == (learning.machine(), "not recorded")
     assert f" {os.cpu_count()} cores, PyTorch {torch.__version__}" in kept.machine
-    names = ("eval/commands_completed", "eval/return", "eval/length", "charts/seconds_iteration", *evaluate.UPDATE_CURVES)
-    for name in names:
+    scores = ("eval/commands_completed", "eval/return", "eval/length")
+    for name in (*scores, "charts/seconds_iteration", *evaluate.UPDATE_CURVES):
         for one, other in zip(kept.curves[name], whole.curves[name], strict=True):
             assert one == pytest.approx(other, rel=1e-3)
     assert kept.curves["eval/return"][1].shape == (3, 2, 1)

@@ -7,15 +7,15 @@ import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import learning
 import numpy as np
 import optuna
 import pytest
-import tune
 from optuna.trial import TrialState, create_trial
 
+import learning
 import ppo_gru
 import ppo_trxl
+import tune
 
 SCRIPTS = (ppo_gru, ppo_trxl)
 TASK = learning.TASKS["mortar-mayhem"]

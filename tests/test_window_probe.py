@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-import window_probe
 
 import evaluate
 import ppo_gru
 import ppo_trxl
+import window_probe
 
 TASK = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector", "save_model": True}
 

@@ -3,8 +3,9 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from level_statistics import THESIS, fewest_steps, path_lengths, spotlight_lengths
 from players import player
+
+from level_statistics import THESIS, fewest_steps, path_lengths, spotlight_lengths
 
 
 def test_optimal_length_of_spotlight_levels():
