@@ -194,6 +194,9 @@ class Args:
     """weight of the entropy bonus from step --anneal-steps on"""
     anneal_steps: NonNegativeInt = 163_840_000
     """steps over which learning rate and entropy bonus decay linearly (0: they keep their initial values)"""
+    log_barrier_coef: NonNegativeFloat = 0.0
+    """weight of the mean log-probability of all actions: unlike the entropy bonus, it brings back an action whose
+    probability has vanished (0: off)"""
     reconstruction_coef: NonNegativeFloat = 0.0
     """weight of the loss of reconstructing the image from the memory's output (0: off; the thesis has 0.1)"""
     reconstruction_detach: bool = False
@@ -327,6 +330,15 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: f
         clipped = old_values + (values - old_values).clamp(-clip_coef, clip_coef)
         loss = torch.maximum(loss, (clipped - returns).square())
     return loss.mean()
+
+
+def log_barrier(policy: list[Categorical]) -> Tensor:
+    """Return the log-probability's mean over all actions, not only those taken, and samples; its sum over branches.
+
+    It is largest for a uniform policy. Where an action's probability is near 0, so are the gradients of the surrogate
+    loss and of the entropy, but not this one (Agarwal et al., 2021, section 5.2).
+    """
+    return sum(branch.logits.mean() for branch in policy)  # a Categorical's logits are normalized
 
 
 def reconstruction_loss(logits: Tensor, pixels: Tensor) -> Tensor:
@@ -694,17 +706,16 @@ class Agent(nn.Module):
 
     def evaluate_actions(
         self, observations: "UniqueObservations", actions: Tensor, pieces: Pieces, state: MemoryState
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[list[Categorical], Tensor, Tensor, Tensor]:
         """Recompute, with gradient, what `act` computed at the steps of the pieces.
 
-        Returns the log-probabilities (B, A) of the actions (B, A), entropies (B,), values (B,) and features (B, F).
+        Returns the policy, a distribution of B actions for each branch, the log-probabilities (B, A) of the actions
+        (B, A), values (B,) and features (B, F).
         """
         x = observations.encode(self.encoder, pieces.flat_index())  # (B, D); section 9: on a CPU, equal ones once
         logits, values, features = self.heads(self.memory.unroll(x, pieces, state))
         policy = self.heads.distributions(logits)
-        log_probs = log_probs_of(policy, actions)
-        entropy = torch.stack([branch.entropy() for branch in policy], -1).sum(-1)  # of independent branches: the sum
-        return log_probs, entropy, values, features
+        return policy, log_probs_of(policy, actions), values, features
 
 
 def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
@@ -828,20 +839,23 @@ def ppo_loss(
         return stored.flatten(0, 1).index_select(0, index)  # (T, N, ...) to (B, ...)
 
     with autocast(args, index.device):
-        log_probs, entropy, values, features = agent.evaluate_actions(
+        policy, log_probs, values, features = agent.evaluate_actions(
             observations, gather(rollout.actions), minibatch, rollout.memory_state
         )
-    log_ratio, entropy = log_probs - gather(rollout.log_probs), entropy.mean()  # (B, A), ()
+    log_ratio = log_probs - gather(rollout.log_probs)  # (B, A)
     advantages, old_values, returns = gather(rollout.advantages), gather(rollout.values), gather(rollout.returns)
     if args.norm_adv == "minibatch":
         advantages = normalize(advantages)
     pg_loss = policy_loss(log_ratio, advantages, args.clip_coef)
     v_loss = value_loss(values, old_values, returns, args.clip_coef if args.clip_vloss else None)
-    loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy
+    entropy = sum(branch.entropy() for branch in policy).mean()  # of independent branches: the sum
+    barrier = log_barrier(policy)
+    loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy - args.log_barrier_coef * barrier
     logs = {
         "policy_loss": pg_loss,
         "value_loss": v_loss,
         "entropy": entropy,
+        "log_barrier": barrier,
         **policy_metrics(log_ratio, args.clip_coef),
     }
     for name, auxiliary in auxiliary_losses(agent, features, rollout, gather, args).items():

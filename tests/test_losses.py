@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from torch.distributions import Categorical
 
 import ppo_gru
 from ppo_gru import UniqueObservations, adapt_lr, anneal, explained_variance, policy_loss, ppo_loss, value_loss
@@ -29,6 +30,24 @@ def test_value_loss_is_the_larger_of_clipped_and_unclipped():
     # The first value moved by 1, clipped to 0.1: max((1 - 2)^2, (0.1 - 2)^2); the second did not move.
     assert value_loss(values, old, returns, 0.1).item() == pytest.approx((1.9**2 + 1.0) / 2)
     assert value_loss(values, old, returns, None).item() == pytest.approx(1.0)
+
+
+def test_log_barrier_is_a_sum_over_branches_of_means_over_actions():
+    probs = [torch.tensor([[0.5, 0.5], [0.2, 0.8]]), torch.tensor([[0.25, 0.25, 0.5], [0.1, 0.3, 0.6]])]
+    expected = math.log(0.5 * 0.5 * 0.2 * 0.8) / 4 + math.log(0.25 * 0.25 * 0.5 * 0.1 * 0.3 * 0.6) / 6
+    assert ppo_gru.log_barrier([Categorical(probs=p) for p in probs]).item() == pytest.approx(expected)
+
+
+def test_only_the_log_barrier_brings_back_an_action_whose_probability_is_zero():
+    """With logits 40 apart, no gradient of the surrogate or of the entropy is left; the barrier's is 1/3 - p."""
+    logits = torch.tensor([[40.0, 0.0, 0.0]], requires_grad=True)
+    policy, taken = Categorical(logits=logits), torch.tensor([0])
+    surrogate = policy_loss(policy.log_prob(taken)[:, None], torch.tensor([-1.0]), 0.2)
+    for objective in (surrogate, policy.entropy().sum()):
+        (gradient,) = torch.autograd.grad(objective, logits, retain_graph=True)
+        assert gradient.abs().max() < 1e-15
+    (gradient,) = torch.autograd.grad(ppo_gru.log_barrier([policy]), logits)
+    torch.testing.assert_close(gradient, torch.tensor([[1 / 3 - 1, 1 / 3, 1 / 3]]))
 
 
 @pytest.mark.parametrize(("step", "expected"), [(0, 1.0), (50, 0.6), (100, 0.2), (1000, 0.2)])
@@ -56,7 +75,7 @@ def test_explained_variance():
 
 
 def test_the_total_loss_is_composed_as_in_equation_5_7(played):
-    args, run, *_ = played(env_id="CueRecall-v0", vf_coef=3.0)
+    args, run, *_ = played(env_id="CueRecall-v0", vf_coef=3.0, log_barrier_coef=7.0)
     rollout, agent = run.rollout, run.agent
     with torch.no_grad():
         for parameter in agent.heads.policy[-1].parameters():
@@ -67,8 +86,9 @@ def test_the_total_loss_is_composed_as_in_equation_5_7(played):
     observations = UniqueObservations(rollout.obs, agent)
     loss, logs = ppo_loss(agent, rollout, observations, pieces, 5.0, args)
     assert logs["entropy"].item() == pytest.approx(2 * math.log(2)), "the sum over both branches"
+    assert logs["log_barrier"].item() == pytest.approx(2 * math.log(0.5)), "the same"
     assert logs["policy_loss"].item() == pytest.approx(-rollout.advantages.mean().item())
-    parts = logs["policy_loss"] + 3.0 * logs["value_loss"] - 5.0 * logs["entropy"]
+    parts = logs["policy_loss"] + 3.0 * logs["value_loss"] - 5.0 * logs["entropy"] - 7.0 * logs["log_barrier"]
     assert loss.item() == pytest.approx(parts.item())
     normalize = dataclasses.replace(args, norm_adv="minibatch")
     normalized = ppo_loss(agent, rollout, observations, pieces, 5.0, normalize)[1]

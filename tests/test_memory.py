@@ -44,7 +44,7 @@ def recompute(run):
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
     index = pieces.flat_index()
     observations, actions = ppo_gru.UniqueObservations(rollout.obs, run.agent), rollout.actions.flatten(0, 1)[index]
-    log_probs, _, values, _ = run.agent.evaluate_actions(observations, actions, pieces, rollout.memory_state)
+    _, log_probs, values, _ = run.agent.evaluate_actions(observations, actions, pieces, rollout.memory_state)
     return index, (log_probs - rollout.log_probs.flatten(0, 1)[index]).exp(), values
 
 

@@ -28,8 +28,9 @@ MEMORIES = [
 CURVES = {
     "charts/SPS", "charts/seconds_iteration", "charts/seconds_collect", "charts/seconds_update",
     "charts/learning_rate", "charts/entropy_coefficient", "charts/padding_fraction",
-    "losses/policy_loss", "losses/value_loss", "losses/entropy", "losses/loss", "losses/approx_kl",
-    "losses/old_approx_kl", "losses/clipfrac", "losses/explained_variance", "losses/grad_norm", "losses/ratio_error",
+    "losses/policy_loss", "losses/value_loss", "losses/entropy", "losses/log_barrier", "losses/loss",
+    "losses/approx_kl", "losses/old_approx_kl", "losses/clipfrac", "losses/explained_variance", "losses/grad_norm",
+    "losses/ratio_error",
 }  # fmt: skip
 EPISODES = {"charts/episodic_return", "charts/episodic_length"}
 
