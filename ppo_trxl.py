@@ -193,15 +193,15 @@ class Args:
     """learning rate at the first step"""
     final_lr: UnitInterval = 1.0e-5
     """learning rate from step --anneal-steps on"""
+    exploration_bonus: Literal["entropy", "log-barrier"] = "entropy"
+    """what keeps the policy exploring: its entropy, or the mean log-probability of all actions, which also brings back
+    an action whose probability has vanished"""
     init_ent_coef: NonNegativeFloat = 1.0e-4
-    """weight of the entropy bonus at the first step"""
+    """weight of the exploration bonus at the first step"""
     final_ent_coef: NonNegativeFloat = 1.0e-6
-    """weight of the entropy bonus from step --anneal-steps on"""
+    """weight of the exploration bonus from step --anneal-steps on"""
     anneal_steps: NonNegativeInt = 163_840_000
-    """steps over which learning rate and entropy bonus decay linearly (0: they keep their initial values)"""
-    log_barrier_coef: NonNegativeFloat = 0.0
-    """weight of the mean log-probability of all actions: unlike the entropy bonus, it brings back an action whose
-    probability has vanished (0: off)"""
+    """steps over which learning rate and exploration bonus decay linearly (0: they keep their initial values)"""
     reconstruction_coef: NonNegativeFloat = 0.0
     """weight of the loss of reconstructing the image from the memory's output (0: off; the thesis has 0.1)"""
     reconstruction_detach: bool = False
@@ -1124,14 +1124,16 @@ def ppo_loss(
         advantages = normalize(advantages)
     pg_loss = policy_loss(log_ratio, advantages, args.clip_coef)
     v_loss = value_loss(values, old_values, returns, args.clip_coef if args.clip_vloss else None)
-    entropy = sum(branch.entropy() for branch in policy).mean()  # of independent branches: the sum
-    barrier = log_barrier(policy)
-    loss = pg_loss + args.vf_coef * v_loss - ent_coef * entropy - args.log_barrier_coef * barrier
+    bonuses = {
+        "entropy": sum(branch.entropy() for branch in policy).mean(),  # of independent branches: the sum
+        "log-barrier": log_barrier(policy),
+    }
+    loss = pg_loss + args.vf_coef * v_loss - ent_coef * bonuses[args.exploration_bonus]
     logs = {
         "policy_loss": pg_loss,
         "value_loss": v_loss,
-        "entropy": entropy,
-        "log_barrier": barrier,
+        "entropy": bonuses["entropy"],
+        "log_barrier": bonuses["log-barrier"],
         **policy_metrics(log_ratio, args.clip_coef),
     }
     for name, auxiliary in auxiliary_losses(agent, features, rollout, gather, args).items():

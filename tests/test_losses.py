@@ -75,7 +75,7 @@ def test_explained_variance():
 
 
 def test_the_total_loss_is_composed_as_in_equation_5_7(played):
-    args, run, *_ = played(env_id="CueRecall-v0", vf_coef=3.0, log_barrier_coef=7.0)
+    args, run, *_ = played(env_id="CueRecall-v0", vf_coef=3.0)
     rollout, agent = run.rollout, run.agent
     with torch.no_grad():
         for parameter in agent.heads.policy[-1].parameters():
@@ -88,8 +88,11 @@ def test_the_total_loss_is_composed_as_in_equation_5_7(played):
     assert logs["entropy"].item() == pytest.approx(2 * math.log(2)), "the sum over both branches"
     assert logs["log_barrier"].item() == pytest.approx(2 * math.log(0.5)), "the same"
     assert logs["policy_loss"].item() == pytest.approx(-rollout.advantages.mean().item())
-    parts = logs["policy_loss"] + 3.0 * logs["value_loss"] - 5.0 * logs["entropy"] - 7.0 * logs["log_barrier"]
+    parts = logs["policy_loss"] + 3.0 * logs["value_loss"] - 5.0 * logs["entropy"]
     assert loss.item() == pytest.approx(parts.item())
+    barrier = dataclasses.replace(args, exploration_bonus="log-barrier")
+    other = ppo_loss(agent, rollout, observations, pieces, 5.0, barrier)[0]
+    assert (other - loss).item() == pytest.approx(5.0 * (logs["entropy"] - logs["log_barrier"]).item())
     normalize = dataclasses.replace(args, norm_adv="minibatch")
     normalized = ppo_loss(agent, rollout, observations, pieces, 5.0, normalize)[1]
     assert normalized["policy_loss"].item() == pytest.approx(0.0, abs=1e-5), "advantages of mean zero"
