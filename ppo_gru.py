@@ -181,9 +181,6 @@ class Args:
     """a gradient with a larger norm is scaled down to this one"""
     target_kl: PositiveFloat | None = None
     """end an iteration's update at the first minibatch whose KL divergence from the policy that acted exceeds this"""
-    adaptive_lr: bool = False
-    """lower the learning rate after an update that --target-kl ended, and raise it again, up to the annealed one, after
-    whole ones"""
     init_lr: UnitInterval = 2.75e-4
     """learning rate at the first step"""
     final_lr: UnitInterval = 1.0e-5
@@ -270,15 +267,6 @@ def anneal(step: int, initial: float, final: float, anneal_steps: int) -> float:
     """Decay linearly from initial to final over anneal_steps, then stay; without anneal_steps stay at initial."""
     fraction = min(step / anneal_steps, 1.0) if anneal_steps else 0.0
     return initial + fraction * (final - initial)
-
-
-def adapt_lr(scale: float, share: float) -> float:
-    """Return the learning rate's next scale, given the present one and the share of gradient steps that were taken.
-
-    After an update that --target-kl ended early, the scale is multiplied by that share, but by 0.5 at least; a whole
-    update raises it by 2 %, up to 1. (The penalty of Schulman et al., 2017, section 4, adapts in a similar way.)
-    """
-    return scale * max(share, 0.5) if share < 1 else min(1.02 * scale, 1.0)
 
 
 def gae(
@@ -963,7 +951,7 @@ def train(args: Args, run: "Run") -> None:
     agent, rollout, batch_size = run.agent, run.rollout, args.num_envs * args.num_steps
     for step in range(run.step, args.total_timesteps - batch_size + 1, batch_size):
         began, run.iteration = time.perf_counter(), step // batch_size + 1
-        lr = run.lr_scale * anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
+        lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
         ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
         run.optimizer.param_groups[0]["lr"].fill_(lr)
 
@@ -981,9 +969,6 @@ def train(args: Args, run: "Run") -> None:
         )
         rollout.returns = rollout.advantages + rollout.values
         logs = update(agent, run.optimizer, rollout, ent_coef, args)
-        if args.adaptive_lr:
-            whole_update = args.update_epochs * args.num_minibatches
-            run.lr_scale = adapt_lr(run.lr_scale, logs["charts/gradient_steps"] / whole_update)
         updated = time.perf_counter()
 
         logs |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
@@ -1072,7 +1057,6 @@ class Run:
     bar: tqdm | None = None
     iteration: int = 0  # the present one, from 1
     step: int = 0  # so far, of all environments together
-    lr_scale: float = 1.0  # of --adaptive-lr
     seconds: float = 0.0  # of training, without evaluations
     returns: deque = field(default_factory=lambda: deque(maxlen=100))  # of the last episodes, for the progress bar
     lengths: deque = field(default_factory=lambda: deque(maxlen=100))
@@ -1122,8 +1106,6 @@ def check_args(args: Args) -> None:
             raise ValueError(f"{flag(name)} is {value}; it must be below 2 ** 63")
     if not args.exp_name or set(args.exp_name) & set("/\\"):
         raise ValueError(f"--exp-name is {args.exp_name!r}; it must be a name without slashes")
-    if args.adaptive_lr and args.target_kl is None:
-        raise ValueError("--adaptive-lr follows --target-kl, which is not given; give it a limit, e.g. 0.05")
     batch_size = args.num_envs * args.num_steps
     if args.total_timesteps < batch_size:
         raise ValueError(
@@ -1444,7 +1426,7 @@ def save_checkpoint(args: Args, run: Run) -> None:
         for file in run.folder.glob("events.out.tfevents.*"):
             flush_to_disk(file)  # a checkpoint means that the curves are there too
     run_state = {"seconds": run.seconds, "returns": list(run.returns), "lengths": list(run.lengths)}
-    run_state |= {"optimizer": run.optimizer.state_dict(), "lr_scale": run.lr_scale}
+    run_state["optimizer"] = run.optimizer.state_dict()
     run_state["processes"] = map_nested(processes, np.ndarray, torch.from_numpy)  # weights_only loads no arrays
     write_file(model_of(args, run) | run_state, run.folder / f"checkpoint-{run.step}.pt")
     for path in checkpoints_in(run.folder)[:-2]:
@@ -1481,7 +1463,7 @@ def load_checkpoint(run: Run, saved: dict[str, Any]) -> None:
                 f"{run.folder}: its checkpoint is of a version with the weights in another order, and training cannot "
                 "go on from it; --load-model takes its weights"
             )
-    run.step, run.seconds, run.lr_scale = saved["step"], saved["seconds"], saved.get("lr_scale", 1.0)
+    run.step, run.seconds = saved["step"], saved["seconds"]
     run.returns.extend(saved["returns"])
     run.lengths.extend(saved["lengths"])
     rank, rollout = rank_and_size()[0], run.rollout

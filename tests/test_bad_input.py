@@ -31,7 +31,6 @@ CASES = {
     "--final-lr inf": "--final-lr is inf; it must be 0 to 1",
     "--clip-coef 0": "--clip-coef is 0.0; it must be above 0",
     "--target-kl -1": "--target-kl is -1.0; it must be above 0",
-    "--adaptive-lr": "--adaptive-lr follows --target-kl, which is not given",
     "--total-timesteps 100": "--total-timesteps is 100, less than one iteration of 16384 steps",
     "--num-minibatches 64": "--num-minibatches is 64, but an iteration may have only 32 pieces",
     "--num-minibatches 200 --seq-len 100": "may have only 163 pieces",

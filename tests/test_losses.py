@@ -8,7 +8,7 @@ import torch
 from torch.distributions import Categorical
 
 import ppo_gru
-from ppo_gru import UniqueObservations, adapt_lr, anneal, explained_variance, policy_loss, ppo_loss, value_loss
+from ppo_gru import UniqueObservations, anneal, explained_variance, policy_loss, ppo_loss, value_loss
 
 
 def test_policy_loss_clips_every_branch_by_itself():
@@ -53,14 +53,6 @@ def test_only_the_log_barrier_brings_back_an_action_whose_probability_is_zero():
 @pytest.mark.parametrize(("step", "expected"), [(0, 1.0), (50, 0.6), (100, 0.2), (1000, 0.2)])
 def test_anneal_decays_linearly_then_stays(step, expected):
     assert anneal(step, 1.0, 0.2, 100) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(
-    ("scale", "share", "expected"),
-    [(1.0, 1.0, 1.0), (0.5, 1.0, 0.51), (0.99, 1.0, 1.0), (0.5, 0.75, 0.375), (0.5, 0.1, 0.25)],
-)
-def test_learning_rate_falls_with_the_share_of_steps_and_rises_slowly(scale, share, expected):
-    assert adapt_lr(scale, share) == pytest.approx(expected)
 
 
 def test_no_anneal_steps_keep_the_initial_value():

@@ -31,7 +31,6 @@ RUNS = {
     "GRU, ground truth": {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "ground_truth_coef": 0.1},
     "GRU, probe": {**GRID, "ground_truth_coef": 0.1, "ground_truth_detach": True, "observe_last_action": True},
     "GRU, evaluations": {**GRID, "eval_interval": 2, "eval_levels": 3, "eval_repeats": 2},
-    "GRU, adaptive learning rate": {**GRID, "target_kl": 1e-5, "adaptive_lr": True},
     "GRU, truncated": {
         "env_id": "SearingSpotlights-v0", "env_options": '{"max_steps": 9}', "bootstrap_truncated": True
     },

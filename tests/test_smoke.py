@@ -233,18 +233,6 @@ def test_annealing(tiny, scalars):
     assert still["charts/learning_rate"] == pytest.approx([1e-3, 1e-3])
 
 
-def test_adaptive_learning_rate_follows_the_gradient_steps(tiny, scalars):
-    """An update of fewer than its six steps, since the limit ended it, lowers the rate; the others raise it."""
-    limits = {"update_epochs": 3, "target_kl": 1e-4, "adaptive_lr": True, "init_lr": 1e-3, "anneal_steps": 0}
-    curves = scalars(ppo_gru.main(tiny(env_id="CueRecall-v0", total_timesteps=1024, **limits)))
-    shares = [steps / 6 for steps in curves["charts/gradient_steps"]]
-    assert min(shares) < max(shares) == 1.0, "updates that were ended, and whole ones"
-    expected = [1e-3]
-    for share in shares[:-1]:
-        expected.append(min(expected[-1] * (1.02 if share == 1.0 else max(share, 0.5)), 1e-3))
-    assert curves["charts/learning_rate"] == pytest.approx(expected)
-
-
 @pytest.mark.parametrize("target_kl", [None, 1e-9, 3e-5, 1e9])
 def test_target_kl_ends_the_update_at_the_first_minibatch_beyond_it(played, monkeypatch, target_kl):
     args, run, *_ = played(env_id="CueRecall-v0", update_epochs=5, target_kl=target_kl)
