@@ -358,10 +358,10 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: f
 
 
 def log_barrier(policy: list[Categorical]) -> Tensor:
-    """Return the log-probability's mean over all actions, not only those taken, and samples; its sum over branches.
+    """Return the mean log-probability of all actions, not only of those taken: over samples, summed over branches.
 
-    It is largest for a uniform policy. Where an action's probability is near 0, so are the gradients of the surrogate
-    loss and of the entropy, but not this one (Agarwal et al., 2021, section 5.2).
+    It is largest for a uniform policy. Where an action's probability is near 0, the gradients of the surrogate loss and
+    of the entropy are near 0 too; that of the log barrier is not (Agarwal et al., 2021).
     """
     return sum(branch.logits.mean() for branch in policy)  # a Categorical's logits are normalized
 
