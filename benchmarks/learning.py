@@ -45,12 +45,15 @@ MEMORIES = {
     "TrXL": "ppo_trxl.py",
     "GTrXL": "ppo_trxl.py --trxl-gate gru",
 }
+# The thesis' exploration bonus, with the weights that suit it on these tasks; the preset has the log barrier.
+ENTROPY = "--exploration-bonus entropy --init-ent-coef 1e-3 --final-ent-coef 1e-4"
 AGENTS = {
     "no memory": "ppo_gru.py --memory none",
     "stack of 4": "ppo_gru.py --memory none --frame-stack 4",
     "stack of 16": "ppo_gru.py --memory none --frame-stack 16",
     "step encoding": "ppo_gru.py --memory none --step-encoding",
     **MEMORIES,
+    **{f"{name}, entropy": f"{flags} {ENTROPY}" for name, flags in MEMORIES.items()},
     **{f"{name}, refreshed": f"{flags} --refresh-memory" for name, flags in MEMORIES.items()},
     **{f"{name}, gradient": f"{MEMORIES[name]} --trxl-memory-gradient" for name in ("TrXL", "GTrXL")},
     **{
@@ -347,27 +350,37 @@ def report(task: Task, steps: int, runs: dict[str, list[evaluate.RunLog]]) -> No
     print(f"\nMachines: {'; '.join(machines)}")
 
 
-def main(config: Config) -> None:
-    """Train what is missing, then print the tables and draw the curves.
+def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
+    """Return the trainings that are wanted, by task, agent and seed.
 
-    Raises SystemExit for names that it does not know, for what cannot be planned, and for trainings that failed.
+    Raises SystemExit for names that this program does not know, no seed, and what cannot be planned.
     """
     suite_tasks, suite_agents = SUITES[config.suite]
     tasks, agents = config.tasks or suite_tasks, config.agents or suite_agents
+    if not config.seeds:
+        raise SystemExit("--seeds is empty; give at least one")
     for given, known in ((tasks, TASKS), ([agent.partition(" --")[0] for agent in agents], AGENTS)):
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"there is no {unknown[0]}; there are {', '.join(known)}")
-    # All are planned here: tyro, which parses their command lines, is not made for several threads.
-    plans = {
+    return {
         (task, agent, seed): plan(config, TASKS[task], agent, seed)
         for task in tasks
         for seed in config.seeds
         for agent in agents
     }
+
+
+def main(config: Config) -> None:
+    """Train what is missing, then print the tables and draw the curves.
+
+    Raises SystemExit as `plans_of` does, and for trainings that failed.
+    """
+    plans = plans_of(config)  # all at once: tyro, which parses their command lines, is not made for several threads
     train_missing(config, [*plans.values()])
     runs = {key: result_of(config, each) for key, each in plans.items()}
+    tasks, agents, _ = map(dict.fromkeys, zip(*plans, strict=True))
     for name in tasks:
-        steps = plans[name, agents[0], config.seeds[0]].args.total_timesteps
+        steps = plans[name, next(iter(agents)), config.seeds[0]].args.total_timesteps
         report(TASKS[name], steps, {agent: [runs[name, agent, seed] for seed in config.seeds] for agent in agents})
     evaluate.draw_curves(evaluate.Config(curves=tuple(run.path for run in runs.values()), out=str(config.out)))
 

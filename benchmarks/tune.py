@@ -94,6 +94,7 @@ def one_of(*choices: Any) -> BaseDistribution:
 SPACE = {
     "init_lr": log_range(1e-4, 3e-3),
     "final_lr_fraction": log_range(0.01, 1.0),  # of init_lr
+    "exploration_bonus": one_of("entropy", "log-barrier"),
     "init_ent_coef": log_range(1e-5, 3e-2),
     "final_ent_fraction": log_range(0.01, 1.0),  # of init_ent_coef
     # num_envs x num_steps. Fewer environments make a step costly, larger rollouts leave few updates.

@@ -22,6 +22,7 @@ import pytest
 import tyro
 from torch.distributed import run as torchrun
 
+import learning
 import memory_gym_envs  # noqa: F401 (registers the ids)
 import ppo_gru
 import ppo_trxl
@@ -197,6 +198,21 @@ def test_command(page, command):
     assert words[0] == "-m" or (ROOT / path).exists()
     wrong = error(parser(import_program(path)), arguments)
     assert wrong is None, f"{page}: {command}\n{wrong}"
+
+
+DRAWN = sorted({call for _, call in COMMANDS.values() if "learning.py" in call and "--results benchmarks/res" in call})
+
+
+@pytest.mark.parametrize("command", DRAWN, ids=range(len(DRAWN)))
+def test_nobody_has_to_train_again_what_is_in_the_repository(command):
+    """Where a page's command names the results that are there, all that it wants is among them, and complete."""
+    config = tyro.cli(learning.Config, args=shlex.split(command)[2:])
+    config.results = ROOT / config.results
+    for plan in learning.plans_of(config).values():
+        run = learning.result_of(config, plan)
+        assert run is not None, f"there is no result of {plan}"
+        assert learning.is_complete(run)
+        assert len(run.curves[f"eval/{plan.task.metric}"][0]) >= config.evaluations
 
 
 OPTIONS = sorted({call for _, call in COMMANDS.values() if "--env-options" in call})
