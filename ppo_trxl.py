@@ -48,6 +48,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 import torch.distributed as dist
+import torch.distributed.nn  # see `setup`
 import torch.nn.functional as F
 import tyro
 from torch import Tensor, nn
@@ -1426,6 +1427,8 @@ def setup(args: Args) -> Run:
     ImportError or gymnasium.error.Error, each with one line for the user.
     """
     if dist.is_torchelastic_launched() and not dist.is_initialized():  # by torchrun
+        # torch.distributed.nn is imported at the top: imported later, by an optimizer, it would keep this group, and
+        # Gloo's threads with it, until the interpreter ends, where they can abort the process.
         dist.init_process_group(timeout=timedelta(days=1))  # the others wait while the first one evaluates
     checkpoint = None if args.resume is None else read_checkpoint(args.resume)
     if checkpoint is not None:

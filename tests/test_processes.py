@@ -101,6 +101,22 @@ def test_gradients_are_means_over_steps(monkeypatch, tiny, obs_type):
         assert parameter.grad.stride() == parameter.stride()
 
 
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_no_thread_of_the_group_outlives_the_training(script):
+    """Where one is still there when the interpreter ends, the process may abort."""
+    Path("threads.py").write_text(f"""
+import sys
+from pathlib import Path
+import {script.__name__} as script
+script.main(script.parse_args(sys.argv[1:]))
+print([name for task in Path("/proc/self/task").iterdir() if "gloo" in (name := (task / "comm").read_text())])
+""")
+    line = torchrun("threads.py", *flags_of(script), "--total-timesteps", "128")
+    environment = {**os.environ, "PYTHONPATH": str(Path(script.__file__).parent)}
+    found = subprocess.run(line, check=True, timeout=300, capture_output=True, text=True, env=environment)
+    assert re.findall(r"\[.*?\]", found.stdout) == ["[]", "[]"]
+
+
 def test_a_maximum_is_the_maximum_of_all_processes():
     logs = [{"charts/memory_window": 40.0, "losses/loss": 1.0}, {"charts/memory_window": 100.0, "losses/loss": 2.0}]
     combined, *_ = ppo_trxl.combine_processes([(each, {}, 0) for each in logs])
