@@ -127,7 +127,7 @@ class Args:
     """iterations between checkpoints; another one is written when training ends or is stopped, and the last two are
     kept (0: no checkpoints)"""
     keep_models: NonNegativeInt = 0
-    """keep the weights at so many evenly spaced points of the training, as model-STEP.pt"""
+    """number of evenly spaced points of the training at which the weights are kept, as model-STEP.pt"""
 
     env_id: str = "MortarMayhem-Grid-v0"
     """any Gymnasium id with Discrete or MultiDiscrete actions, with its module if that has to be imported first, e.g.
@@ -142,7 +142,7 @@ class Args:
     """what a Memory Gym environment shows: images, or a vector of all that can be seen on them (other environments have
     one kind of observation)"""
     frame_stack: NonNegativeInt = 0
-    """observe the last so many images at once, in grayscale, or so many vectors (0: the present one, in colour)"""
+    """observe the last so many images at once, in grayscale, or so many vectors (0: the current one, in colour)"""
     step_encoding: bool = False
     """observe the number of the episode's step too, as a sinusoidal encoding of width 16"""
     observe_last_action: bool = False
@@ -167,7 +167,7 @@ class Args:
     gae_lambda: UnitInterval = 0.95
     """lambda of generalized advantage estimation"""
     refresh_memory: bool = False
-    """before every epoch but the first, recompute the memory that the rollout stored, with the present weights"""
+    """before every epoch but the first, recompute the memory that the rollout stored, with the current weights"""
     bootstrap_truncated: bool = False
     """value the final observation of an episode that a time limit cut short, instead of counting it as ended"""
     norm_adv: Literal["none", "minibatch", "batch"] = "none"
@@ -305,7 +305,8 @@ def normalize(x: Tensor) -> Tensor:
 
 def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tensor:
     """Return the clipped surrogate loss (2.41) of log_ratio (B, A): its mean over branches (5.4) and samples."""
-    ratio, advantages = log_ratio.exp(), advantages[:, None]
+    ratio = log_ratio.exp()
+    advantages = advantages[:, None]
     clipped = ratio.clamp(1 - clip_coef, 1 + clip_coef)
     return -torch.minimum(ratio * advantages, clipped * advantages).mean()
 
@@ -339,7 +340,8 @@ def reconstruction_loss(logits: Tensor, pixels: Tensor) -> Tensor:
 @torch.no_grad()
 def policy_metrics(log_ratio: Tensor, clip_coef: float) -> dict[str, Tensor]:
     """Return what to log of log_ratio (B, A): how far the policy has moved from the rollout's."""
-    deviation, joint = log_ratio.exp() - 1, log_ratio.sum(-1)  # the branches are independent: log-ratios add up
+    deviation = log_ratio.exp() - 1
+    joint = log_ratio.sum(-1)  # the branches are independent: log-ratios add up
     return {
         "old_approx_kl": -joint.mean(),
         "approx_kl": (joint.exp() - 1 - joint).mean(),  # http://joschu.net/blog/kl-approx.html
@@ -413,7 +415,9 @@ class Pieces:
         """Shuffle the pieces, and distribute them, whole, over count minibatches of about the same number of steps."""
         order = torch.randperm(len(self.first))
         first, length = self.first[order], self.length[order]
-        minibatch = (length.cumsum(0) - length) * count // length.sum()  # (S,) the one that a piece goes to
+        # (S,) the one that a piece goes to, by where its first step falls. None is empty: `check_args` makes sure that
+        # no piece is longer than a minibatch's share of the steps.
+        minibatch = (length.cumsum(0) - length) * count // length.sum()
         sizes = minibatch.bincount(minlength=count).tolist()
         for mb_first, mb_length in zip(first.split(sizes), length.split(sizes), strict=True):
             yield Pieces(mb_first, mb_length, self.num_envs)
@@ -740,7 +744,8 @@ class Rollout:
     @classmethod
     def allocate(cls, num_steps: int, obs: dict[str, np.ndarray], truth: np.ndarray | None, agent: Agent) -> "Rollout":
         """Make a rollout on the agent's device that begins with these observations and ground truths."""
-        num_envs, device = len(next(iter(obs.values()))), next(agent.parameters()).device
+        num_envs = len(next(iter(obs.values())))
+        device = next(agent.parameters()).device
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(num_steps, num_envs, *shape, dtype=dtype, device=device)
@@ -782,7 +787,8 @@ def collect(
     episode is reset in the same step, so that next_obs begins the next one. Metrics are lists by name:
     charts/episodic_return, charts/episodic_length, and episode/* for every number in the environment's final info.
     """
-    device, episodes = rollout.values.device, defaultdict(list)
+    device = rollout.values.device
+    episodes = defaultdict(list)
     rollout.truncation_values.zero_()
     with autocast(args, device):
         state = agent.memory.begin_rollout(rollout.memory_state)
@@ -875,7 +881,7 @@ def auxiliary_losses(
 
 @torch.no_grad()
 def refresh_memory(agent: Agent, rollout: Rollout, args: Args) -> None:
-    """Store again, with the present weights, what the rollout stored of the memory (§7.1.4; Kapturowski et al., 2019).
+    """Store again, with the current weights, what the rollout stored of the memory (§7.1.4; Kapturowski et al., 2019).
 
     What was stored before the rollout stays as it is. With the weights that acted, nothing changes, to the last bit.
     """
@@ -900,11 +906,7 @@ def update(
         rollout.advantages = normalize(rollout.advantages)
     observations = UniqueObservations(rollout.obs, agent)
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
-    # A detached head is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
-    auxiliary = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
-    probes = [[*module.parameters()] for module, detached in auxiliary if module is not None and detached]
-    apart = {parameter for probe in probes for parameter in probe}
-    parameters = [parameter for parameter in agent.parameters() if parameter not in apart]
+    clipped_together = groups_to_clip(agent, args)
     logs = []
     for minibatch in epochs(agent, rollout, pieces, args):
         loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
@@ -915,9 +917,9 @@ def update(
         optimizer.zero_grad()
         loss.backward()
         average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
-        log["grad_norm"] = nn.utils.clip_grad_norm_(parameters, args.max_grad_norm)
-        probe_norms = sum(nn.utils.clip_grad_norm_(probe, args.max_grad_norm) for probe in probes)
-        if not (log["loss"] + log["grad_norm"] + probe_norms).isfinite():
+        norms = [nn.utils.clip_grad_norm_(group, args.max_grad_norm) for group in clipped_together]
+        log["grad_norm"] = norms[0]
+        if not torch.stack([log["loss"], *norms]).isfinite().all():
             raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
         optimizer.step()
         logs.append(log)
@@ -931,6 +933,18 @@ def update(
     return {f"losses/{k}": v for k, v in losses.items()} | {f"charts/{k}": v for k, v in charts.items()}
 
 
+def groups_to_clip(agent: Agent, args: Args) -> list[list[nn.Parameter]]:
+    """Return the parameters whose gradients are clipped together: the agent's first, then each detached head's.
+
+    A detached head only asks what the features hold: if its gradient had a share of the norm, it would change the step
+    of all others.
+    """
+    heads = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
+    probes = [[*head.parameters()] for head, detached in heads if head is not None and detached]
+    in_probes = {*itertools.chain(*probes)}
+    return [[parameter for parameter in agent.parameters() if parameter not in in_probes], *probes]
+
+
 def epochs(agent: Agent, rollout: Rollout, pieces: Pieces, args: Args) -> Iterator[Pieces]:
     """Yield the minibatches of all epochs; before each epoch but the first, refresh the memory if that is wanted."""
     for epoch in range(args.update_epochs):
@@ -940,7 +954,7 @@ def epochs(agent: Agent, rollout: Rollout, pieces: Pieces, args: Args) -> Iterat
 
 
 def mean_log(logs: list[dict[str, Tensor]]) -> dict[str, float]:
-    """Return the mean of each metric over the minibatches, with one GPU synchronization for all of them."""
+    """Return the mean of each metric over the minibatches; a GPU is asked for all of them at once."""
     means = torch.stack([torch.stack([*log.values()]) for log in logs]).mean(0)
     return dict(zip(logs[0], means.tolist(), strict=True))
 
@@ -950,9 +964,11 @@ def train(args: Args, run: "Run") -> None:
 
     Raises FloatingPointError if the training diverges, MemoryLimit as the memory does, RunError as `report` does.
     """
-    agent, rollout, batch_size = run.agent, run.rollout, args.num_envs * args.num_steps
+    agent, rollout = run.agent, run.rollout
+    batch_size = args.num_envs * args.num_steps
     for step in range(run.step, args.total_timesteps - batch_size + 1, batch_size):
-        began, run.iteration = time.perf_counter(), step // batch_size + 1
+        began = time.perf_counter()
+        run.iteration = step // batch_size + 1
         lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
         ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
         run.optimizer.param_groups[0]["lr"].fill_(lr)
@@ -1057,7 +1073,7 @@ class Run:
     folder: Path
     writer: SummaryWriter | None = None  # as the progress bar, the first process's alone
     bar: tqdm | None = None
-    iteration: int = 0  # the present one, from 1
+    iteration: int = 0  # the current one, from 1
     step: int = 0  # so far, of all environments together
     seconds: float = 0.0  # of training, without evaluations
     returns: deque = field(default_factory=lambda: deque(maxlen=100))  # of the last episodes, for the progress bar
@@ -1202,7 +1218,8 @@ def make_run(args: Args, step: int) -> Run:
         eval_envs = environments(args, len(evaluation_levels(args))) if evaluates else None
     if rank > 0:  # all processes begin with the same weights, but sample actions of their own
         torch.manual_seed(int(np.random.SeedSequence([args.seed, rank]).generate_state(1)[0]))
-    # As a tensor, the learning rate is set in place; the weight decay is torch's default.
+    # The learning rate is a tensor, thus of float32. A float, which is of float64, would be simpler, but would change
+    # rounding, and with it the curves of docs/results.md. The weight decay is torch's default.
     optimizer = torch.optim.AdamW(agent.parameters(), lr=torch.tensor(args.init_lr), weight_decay=0.01, fused=True)
     folder = Path(args.resume or all_gather(new_folder(args))[0])
     return Run(envs, eval_envs, agent, optimizer, rollout, folder, step=step)
@@ -1588,7 +1605,7 @@ def load_weights(agent: Agent, saved: dict[str, Any], path: str | Path) -> None:
 
 
 def stop_on_signals(run: Run) -> None:
-    """Have SIGINT (Ctrl-C) and SIGTERM end the training after the present iteration, a second Ctrl-C at once.
+    """Have SIGINT (Ctrl-C) and SIGTERM end the training after the current iteration, a second Ctrl-C at once.
 
     A second SIGTERM does not: torchrun passes on the one that a cluster has sent to all processes.
     """

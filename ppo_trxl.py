@@ -4,9 +4,9 @@
 
 The agent gets one observation at a time. Every step leaves an item in the episodic memory: the inputs of the
 transformer's blocks. Each block of a later step attends to the items of the last --trxl-memory-length steps of the
-episode. Items are stored without gradient, as the weights of their rollout computed them; --trxl-memory-gradient
-computes those of the same segment again, with gradient, and --refresh-memory those of the rollout before each epoch but
-the first.
+episode. Items are stored without gradient, computed with the weights that acted. --trxl-memory-gradient computes those
+of the same segment again, with gradient; --refresh-memory computes those of the rollout again, without gradient, before
+each epoch but the first.
 
 A window is never gathered for every query. While acting, each item is projected to its key and value once, into a cache
 that is computed again after each update. For the update, the steps of an environment's rollout and the window before
@@ -132,7 +132,7 @@ class Args:
     """iterations between checkpoints; another one is written when training ends or is stopped, and the last two are
     kept (0: no checkpoints)"""
     keep_models: NonNegativeInt = 0
-    """keep the weights at so many evenly spaced points of the training, as model-STEP.pt"""
+    """number of evenly spaced points of the training at which the weights are kept, as model-STEP.pt"""
 
     env_id: str = "MortarMayhem-Grid-v0"
     """any Gymnasium id with Discrete or MultiDiscrete actions, with its module if that has to be imported first, e.g.
@@ -147,7 +147,7 @@ class Args:
     """what a Memory Gym environment shows: images, or a vector of all that can be seen on them (other environments have
     one kind of observation)"""
     frame_stack: NonNegativeInt = 0
-    """observe the last so many images at once, in grayscale, or so many vectors (0: the present one, in colour)"""
+    """observe the last so many images at once, in grayscale, or so many vectors (0: the current one, in colour)"""
     step_encoding: bool = False
     """observe the number of the episode's step too, as a sinusoidal encoding of width 16"""
     observe_last_action: bool = False
@@ -172,7 +172,7 @@ class Args:
     gae_lambda: UnitInterval = 0.95
     """lambda of generalized advantage estimation"""
     refresh_memory: bool = False
-    """before every epoch but the first, recompute the memory that the rollout stored, with the present weights"""
+    """before every epoch but the first, recompute the memory that the rollout stored, with the current weights"""
     bootstrap_truncated: bool = False
     """value the final observation of an episode that a time limit cut short, instead of counting it as ended"""
     norm_adv: Literal["none", "minibatch", "batch"] = "none"
@@ -242,7 +242,8 @@ class Args:
     trxl_segment_length: PositiveInt = 128
     """steps of one environment that the update computes at once; minibatches are made of such segments"""
     trxl_memory_gradient: bool = False
-    """teach earlier steps of a segment what to leave for later ones: attend to their present inputs, with gradient"""
+    """teach earlier steps of a segment what to leave for later ones: attend to their recomputed inputs, with
+    gradient"""
     trxl_init: Literal["xavier", "orthogonal", "kaiming", "tfixup"] = "xavier"
     """how the blocks' weights are initialized"""
     trxl_layer_norm: Literal["pre", "post"] = "pre"
@@ -342,7 +343,8 @@ def normalize(x: Tensor) -> Tensor:
 
 def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tensor:
     """Return the clipped surrogate loss (2.41) of log_ratio (B, A): its mean over branches (5.4) and samples."""
-    ratio, advantages = log_ratio.exp(), advantages[:, None]
+    ratio = log_ratio.exp()
+    advantages = advantages[:, None]
     clipped = ratio.clamp(1 - clip_coef, 1 + clip_coef)
     return -torch.minimum(ratio * advantages, clipped * advantages).mean()
 
@@ -376,7 +378,8 @@ def reconstruction_loss(logits: Tensor, pixels: Tensor) -> Tensor:
 @torch.no_grad()
 def policy_metrics(log_ratio: Tensor, clip_coef: float) -> dict[str, Tensor]:
     """Return what to log of log_ratio (B, A): how far the policy has moved from the rollout's."""
-    deviation, joint = log_ratio.exp() - 1, log_ratio.sum(-1)  # the branches are independent: log-ratios add up
+    deviation = log_ratio.exp() - 1
+    joint = log_ratio.sum(-1)  # the branches are independent: log-ratios add up
     return {
         "old_approx_kl": -joint.mean(),
         "approx_kl": (joint.exp() - 1 - joint).mean(),  # http://joschu.net/blog/kl-approx.html
@@ -450,7 +453,9 @@ class Pieces:
         """Shuffle the pieces, and distribute them, whole, over count minibatches of about the same number of steps."""
         order = torch.randperm(len(self.first))
         first, length = self.first[order], self.length[order]
-        minibatch = (length.cumsum(0) - length) * count // length.sum()  # (S,) the one that a piece goes to
+        # (S,) the one that a piece goes to, by where its first step falls. None is empty: `check_args` makes sure that
+        # no piece is longer than a minibatch's share of the steps.
+        minibatch = (length.cumsum(0) - length) * count // length.sum()
         sizes = minibatch.bincount(minlength=count).tolist()
         for mb_first, mb_length in zip(first.split(sizes), length.split(sizes), strict=True):
             yield Pieces(mb_first, mb_length, self.num_envs)
@@ -722,7 +727,7 @@ class Block(nn.Module):
 def block_init(block: Block, scheme: str, blocks: int) -> None:
     """Initialize the weights of a block's layers by the scheme (table 6.1), and their biases with zero.
 
-    T-Fixup (Huang et al., 2020) is Xavier with values, outputs and projections scaled down to the depth.
+    T-Fixup (Huang et al., 2020) is Xavier with values, outputs and projections scaled by 0.67 / blocks^(1/4).
     """
     init = {"orthogonal": nn.init.orthogonal_, "kaiming": nn.init.kaiming_normal_}.get(scheme, nn.init.xavier_uniform_)
     for layer in block.modules():
@@ -768,9 +773,12 @@ class Memory(nn.Module):
             raise ValueError(f"--trxl-dim is {args.trxl_dim}; it must be even and a multiple of --trxl-num-heads")
         if inputs != args.trxl_dim:
             raise ValueError(f"--trxl-dim is {args.trxl_dim}; with --no-embedding it must be {inputs} here")
-        self.width, self.window = args.trxl_dim, args.trxl_memory_length
-        self.segment_length, self.query_position = args.trxl_segment_length, args.trxl_query_position
-        self.encoding, self.memory_gradient = args.trxl_positional_encoding, args.trxl_memory_gradient
+        self.width = args.trxl_dim
+        self.window = args.trxl_memory_length
+        self.segment_length = args.trxl_segment_length
+        self.encoding = args.trxl_positional_encoding
+        self.query_position = args.trxl_query_position
+        self.memory_gradient = args.trxl_memory_gradient
         self.cache_dtype = torch.bfloat16 if args.amp else torch.float32  # as the layers deliver keys and values
         self.blocks = nn.ModuleList(Block(args) for _ in range(args.trxl_num_layers))
         for block in self.blocks:
@@ -795,7 +803,7 @@ class Memory(nn.Module):
         )
 
     def begin_rollout(self, state: MemoryState) -> MemoryState:
-        """Move the last W items to the beginning of the timeline, and project them with the present weights."""
+        """Move the last W items to the beginning of the timeline, and project them with the current weights."""
         for stored in (state.items, state.item_steps):
             stored[: self.window] = stored[state.now - self.window : state.now].clone()  # the two may overlap
         state = state._replace(now=self.window)
@@ -873,10 +881,11 @@ class Memory(nn.Module):
             query, step 0            .  .  .           .  .  .      an episode's first step sees nothing
             query, step 1            .  .  .           .  .  1
 
-        With --trxl-memory-gradient, the segment's own are the blocks' present inputs instead of the stored items: the
-        same numbers as long as the weights are, but with a gradient to earlier steps (Dai et al., 2019).
+        With --trxl-memory-gradient, the segment's own are recomputed block inputs instead of the stored items: the same
+        numbers as long as the weights are, but with a gradient to earlier steps (Dai et al., 2019).
         """
-        device, last_row = x.device, len(state.item_steps) - 1
+        device = x.device
+        last_row = len(state.item_steps) - 1  # indices are clamped to it: a short last segment's padding lies beyond
         x = pieces.pad(x)  # (S, L, D)
         first = pieces.first[:, None]  # (S, 1)
         row, env = self.window + first // pieces.num_envs, first % pieces.num_envs  # (S, 1) of a segment's first step
@@ -894,7 +903,8 @@ class Memory(nn.Module):
         used = seen.any(1)  # (S, M); what no query sees becomes zero, so that not even a NaN in it has an effect
         items, item_steps = items.masked_fill(~used[..., None, None], 0.0), item_steps.where(used, 0)
         position = self.position(item_steps, x.dtype)  # (S, M, D)
-        in_query = self.in_query(episode_step, items[:, before - 1 :], x.dtype)
+        step_before = items[:, before - 1 :]  # (S, L, K or K + 1, D): columns -1 .. L - 2
+        in_query = self.in_query(episode_step, step_before, x.dtype)
         for k, block in enumerate(self.blocks):
             block_items = items[:, :, k]
             if self.memory_gradient:
@@ -1016,7 +1026,8 @@ class Rollout:
     @classmethod
     def allocate(cls, num_steps: int, obs: dict[str, np.ndarray], truth: np.ndarray | None, agent: Agent) -> "Rollout":
         """Make a rollout on the agent's device that begins with these observations and ground truths."""
-        num_envs, device = len(next(iter(obs.values()))), next(agent.parameters()).device
+        num_envs = len(next(iter(obs.values())))
+        device = next(agent.parameters()).device
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(num_steps, num_envs, *shape, dtype=dtype, device=device)
@@ -1058,7 +1069,8 @@ def collect(
     episode is reset in the same step, so that next_obs begins the next one. Metrics are lists by name:
     charts/episodic_return, charts/episodic_length, and episode/* for every number in the environment's final info.
     """
-    device, episodes = rollout.values.device, defaultdict(list)
+    device = rollout.values.device
+    episodes = defaultdict(list)
     rollout.truncation_values.zero_()
     with autocast(args, device):
         state = agent.memory.begin_rollout(rollout.memory_state)
@@ -1151,7 +1163,7 @@ def auxiliary_losses(
 
 @torch.no_grad()
 def refresh_memory(agent: Agent, rollout: Rollout, args: Args) -> None:
-    """Store again, with the present weights, what the rollout stored of the memory (§7.1.4; Kapturowski et al., 2019).
+    """Store again, with the current weights, what the rollout stored of the memory (§7.1.4; Kapturowski et al., 2019).
 
     What was stored before the rollout stays as it is. With the weights that acted, nothing changes, to the last bit.
     """
@@ -1176,11 +1188,7 @@ def update(
         rollout.advantages = normalize(rollout.advantages)
     observations = UniqueObservations(rollout.obs, agent)
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
-    # A detached head is a probe: its gradient is clipped apart, and takes no share of the agent's norm.
-    auxiliary = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
-    probes = [[*module.parameters()] for module, detached in auxiliary if module is not None and detached]
-    apart = {parameter for probe in probes for parameter in probe}
-    parameters = [parameter for parameter in agent.parameters() if parameter not in apart]
+    clipped_together = groups_to_clip(agent, args)
     logs = []
     for minibatch in epochs(agent, rollout, pieces, args):
         loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
@@ -1191,9 +1199,9 @@ def update(
         optimizer.zero_grad()
         loss.backward()
         average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
-        log["grad_norm"] = nn.utils.clip_grad_norm_(parameters, args.max_grad_norm)
-        probe_norms = sum(nn.utils.clip_grad_norm_(probe, args.max_grad_norm) for probe in probes)
-        if not (log["loss"] + log["grad_norm"] + probe_norms).isfinite():
+        norms = [nn.utils.clip_grad_norm_(group, args.max_grad_norm) for group in clipped_together]
+        log["grad_norm"] = norms[0]
+        if not torch.stack([log["loss"], *norms]).isfinite().all():
             raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
         optimizer.step()
         logs.append(log)
@@ -1207,6 +1215,18 @@ def update(
     return {f"losses/{k}": v for k, v in losses.items()} | {f"charts/{k}": v for k, v in charts.items()}
 
 
+def groups_to_clip(agent: Agent, args: Args) -> list[list[nn.Parameter]]:
+    """Return the parameters whose gradients are clipped together: the agent's first, then each detached head's.
+
+    A detached head only asks what the features hold: if its gradient had a share of the norm, it would change the step
+    of all others.
+    """
+    heads = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
+    probes = [[*head.parameters()] for head, detached in heads if head is not None and detached]
+    in_probes = {*itertools.chain(*probes)}
+    return [[parameter for parameter in agent.parameters() if parameter not in in_probes], *probes]
+
+
 def epochs(agent: Agent, rollout: Rollout, pieces: Pieces, args: Args) -> Iterator[Pieces]:
     """Yield the minibatches of all epochs; before each epoch but the first, refresh the memory if that is wanted."""
     for epoch in range(args.update_epochs):
@@ -1216,7 +1236,7 @@ def epochs(agent: Agent, rollout: Rollout, pieces: Pieces, args: Args) -> Iterat
 
 
 def mean_log(logs: list[dict[str, Tensor]]) -> dict[str, float]:
-    """Return the mean of each metric over the minibatches, with one GPU synchronization for all of them."""
+    """Return the mean of each metric over the minibatches; a GPU is asked for all of them at once."""
     means = torch.stack([torch.stack([*log.values()]) for log in logs]).mean(0)
     return dict(zip(logs[0], means.tolist(), strict=True))
 
@@ -1226,9 +1246,11 @@ def train(args: Args, run: "Run") -> None:
 
     Raises FloatingPointError if the training diverges, MemoryLimit as the memory does, RunError as `report` does.
     """
-    agent, rollout, batch_size = run.agent, run.rollout, args.num_envs * args.num_steps
+    agent, rollout = run.agent, run.rollout
+    batch_size = args.num_envs * args.num_steps
     for step in range(run.step, args.total_timesteps - batch_size + 1, batch_size):
-        began, run.iteration = time.perf_counter(), step // batch_size + 1
+        began = time.perf_counter()
+        run.iteration = step // batch_size + 1
         lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
         ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
         run.optimizer.param_groups[0]["lr"].fill_(lr)
@@ -1333,7 +1355,7 @@ class Run:
     folder: Path
     writer: SummaryWriter | None = None  # as the progress bar, the first process's alone
     bar: tqdm | None = None
-    iteration: int = 0  # the present one, from 1
+    iteration: int = 0  # the current one, from 1
     step: int = 0  # so far, of all environments together
     seconds: float = 0.0  # of training, without evaluations
     returns: deque = field(default_factory=lambda: deque(maxlen=100))  # of the last episodes, for the progress bar
@@ -1478,7 +1500,8 @@ def make_run(args: Args, step: int) -> Run:
         eval_envs = environments(args, len(evaluation_levels(args))) if evaluates else None
     if rank > 0:  # all processes begin with the same weights, but sample actions of their own
         torch.manual_seed(int(np.random.SeedSequence([args.seed, rank]).generate_state(1)[0]))
-    # As a tensor, the learning rate is set in place; the weight decay is torch's default.
+    # The learning rate is a tensor, thus of float32. A float, which is of float64, would be simpler, but would change
+    # rounding, and with it the curves of docs/results.md. The weight decay is torch's default.
     optimizer = torch.optim.AdamW(agent.parameters(), lr=torch.tensor(args.init_lr), weight_decay=0.01, fused=True)
     folder = Path(args.resume or all_gather(new_folder(args))[0])
     return Run(envs, eval_envs, agent, optimizer, rollout, folder, step=step)
@@ -1864,7 +1887,7 @@ def load_weights(agent: Agent, saved: dict[str, Any], path: str | Path) -> None:
 
 
 def stop_on_signals(run: Run) -> None:
-    """Have SIGINT (Ctrl-C) and SIGTERM end the training after the present iteration, a second Ctrl-C at once.
+    """Have SIGINT (Ctrl-C) and SIGTERM end the training after the current iteration, a second Ctrl-C at once.
 
     A second SIGTERM does not: torchrun passes on the one that a cluster has sent to all processes.
     """
