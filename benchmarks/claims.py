@@ -38,7 +38,8 @@ ALL_IN_VIEW = Task(
     "SearingSpotlights-v0", 1_000_000, dict.fromkeys(("agent_visible", "coins_visible", "exit_visible"), True)
 )
 FEW_FRAMES = ("no memory", "stack of 4", "step encoding")
-# The thesis' learning rate is at its final value after a fifth of the training.
+# The thesis' learning rate is at its final value after a fifth of the training: of the steps of ENDLESS, unless
+# --steps-scale changes them.
 TO_1E_4, TO_1E_5 = "TrXL --anneal-steps 600000", "TrXL --anneal-steps 600000 --final-lr 1e-5"
 # Large steps are what the thesis suspects, and --target-kl would prevent them.
 NOT_NORMALIZED, NORMALIZED = "GRU --target-kl None", "GRU --target-kl None --norm-adv minibatch"

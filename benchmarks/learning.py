@@ -125,7 +125,7 @@ FULL = {
 }
 TASKS = SMALL | FULL
 SUITES = {
-    "small": (SMALL, ("no memory", "stack of 4", "GRU", "TrXL")),
+    "small": (SMALL, ("no memory", "stack of 4", "stack of 16", "GRU", "TrXL")),
     "full": (
         FULL,
         ("no memory", "stack of 4", "stack of 16", "step encoding", *MEMORIES, "TrXL --trxl-query-position"),
@@ -214,7 +214,8 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
 
 def runs_in(place: str, plan: Plan) -> list[evaluate.RunLog]:
     """Return the runs that were planned so among the folders, or the files of results, in a place."""
-    wanted, found = plan.logged_args(), []
+    wanted = plan.logged_args()
+    found = []
     for path in sorted(glob.glob(f"{place}/{plan.task.env_id}__{file_name(plan.agent)}__{plan.seed}__*")):
         with contextlib.suppress(evaluate.NoCurvesError):
             found.append(evaluate.read_run(path))
@@ -296,7 +297,8 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     each_once = {plan.command: plan for plan in wanted}.values()
     missing = [plan for plan in each_once if result_of(config, plan) is None]
-    steps, failed = sum(plan.args.total_timesteps for plan in missing), []
+    steps = sum(plan.args.total_timesteps for plan in missing)
+    failed = []
     with (
         ThreadPoolExecutor(config.jobs) as pool,
         tqdm(total=steps, unit=" steps", unit_scale=True, disable=not missing) as bar,
@@ -337,10 +339,11 @@ def row(agent: str, runs: list[evaluate.RunLog], metric: str, best: float) -> st
     return f"| {agent} | {len(runs)} | {reached} | {' | '.join(taken)} | {minutes[-1]:.1f} |"
 
 
-def report(task: Task, steps: int, runs: dict[str, list[evaluate.RunLog]]) -> None:
+def report(task: Task, runs: dict[str, list[evaluate.RunLog]]) -> None:
     """Print a task's table: the runs of each agent, one a seed, and on which machines they were trained."""
     curves = [evaluate.align([run.curves[f"eval/{task.metric}"] for run in each]) for each in runs.values()]
     best = max(evaluate.iqm(scores[-1]) for _, scores in curves)
+    steps = int(next(iter(runs.values()))[0].args["total_timesteps"])
     print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {steps:,} steps\n")
     print("| agent | seeds | mean | IQM | 95 % interval | largest fall | steps to 0.9 of the best | minutes | in all |")
     print("|---|---:|---:|---:|---|---:|---:|---:|---:|")
@@ -378,10 +381,9 @@ def main(config: Config) -> None:
     plans = plans_of(config)  # all at once: tyro, which parses their command lines, is not made for several threads
     train_missing(config, [*plans.values()])
     runs = {key: result_of(config, each) for key, each in plans.items()}
-    tasks, agents, _ = map(dict.fromkeys, zip(*plans, strict=True))
-    for name in tasks:
-        steps = plans[name, next(iter(agents)), config.seeds[0]].args.total_timesteps
-        report(TASKS[name], steps, {agent: [runs[name, agent, seed] for seed in config.seeds] for agent in agents})
+    agents = dict.fromkeys(agent for _, agent, _ in plans)
+    for name in dict.fromkeys(task for task, _, _ in plans):
+        report(TASKS[name], {agent: [runs[name, agent, seed] for seed in config.seeds] for agent in agents})
     evaluate.draw_curves(evaluate.Config(curves=tuple(run.path for run in runs.values()), out=str(config.out)))
 
 

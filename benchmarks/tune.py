@@ -86,7 +86,7 @@ def log_range(low: float, high: float) -> BaseDistribution:
 
 
 def one_of(*choices: Any) -> BaseDistribution:
-    """Return a choice."""
+    """Return a parameter that takes one of these values."""
     return CategoricalDistribution(choices)
 
 
@@ -233,7 +233,8 @@ def slices(script: ModuleType, args: Any, task: Task) -> Iterator[float]:
     A slice in which no episode ended has the last one's, and after a training has diverged all are 0.
     """
     run = start(script, args)
-    batch_size, last = args.num_envs * args.num_steps, 0.0
+    batch_size = args.num_envs * args.num_steps
+    last = 0.0
     first_steps = np.arange(args.total_timesteps // batch_size) * batch_size
     try:
         for part in np.array_split(first_steps, SLICES):
@@ -284,7 +285,8 @@ def iteration(script: ModuleType, args: Any, run: Any, step: int, metric: str) -
 
 def run_trial(trial: optuna.Trial, config: Config) -> float | None:
     """Train on all tasks in turns, slice by slice; return the trial's score, or None if it was pruned."""
-    began, trainings = time.monotonic(), []
+    began = time.monotonic()
+    trainings = []
     with contextlib.ExitStack() as stack:
         for task, seed in itertools.product([TASKS[name] for name in config.tasks], config.seeds):
             args = arguments(config, task, trial.params, seed, f"trial-{trial.number}")
@@ -393,7 +395,8 @@ def queue_killed_trials(study: optuna.Study, config: Config) -> None:
 def work(config: Config, worker: int, until: float) -> None:
     """Run trials until there are enough or until time.time() is `until`; raise what a training raises."""
     torch.set_num_threads(1)
-    study, before = open_study(config), os.getcwd()
+    study = open_study(config)
+    before = os.getcwd()
     counted = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING)
     os.chdir(config.folder)  # a script makes its run folder in the current one
     try:
