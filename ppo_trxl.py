@@ -261,6 +261,7 @@ PRESETS = {
         "trxl_num_layers": 2,
         "trxl_dim": 64,
         "trxl_memory_length": 128,
+        "trxl_query_position": True,
         "head_size": 128,
         "num_steps": 128,
         "update_epochs": 4,
