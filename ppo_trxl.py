@@ -262,6 +262,7 @@ PRESETS = {
         "trxl_dim": 64,
         "trxl_memory_length": 128,
         "trxl_query_position": True,
+        "trxl_memory_gradient": True,
         "head_size": 128,
         "num_steps": 128,
         "update_epochs": 4,

@@ -39,12 +39,12 @@ import memory_gym_envs
 
 ROOT = Path(__file__).parent.parent
 COMMON = "--preset laptop --save-model"
-# As the thesis has them: unlike those of the preset, a transformer's queries do not know their step.
+TRXL = "ppo_trxl.py --no-trxl-query-position --no-trxl-memory-gradient"  # the thesis', where the preset differs
 MEMORIES = {
     "GRU": "ppo_gru.py --memory gru",
     "LSTM": "ppo_gru.py --memory lstm",
-    "TrXL": "ppo_trxl.py --no-trxl-query-position",
-    "GTrXL": "ppo_trxl.py --no-trxl-query-position --trxl-gate gru",
+    "TrXL": TRXL,
+    "GTrXL": f"{TRXL} --trxl-gate gru",
 }
 # The thesis' exploration bonus, with the weights that suit it on these tasks; the preset has the log barrier.
 ENTROPY = "--exploration-bonus entropy --init-ent-coef 1e-3 --final-ent-coef 1e-4"
@@ -54,6 +54,7 @@ AGENTS = {
     "stack of 16": "ppo_gru.py --memory none --frame-stack 16",
     "step encoding": "ppo_gru.py --memory none --step-encoding",
     **MEMORIES,
+    "TrXL, preset": "ppo_trxl.py",
     **{f"{name}, entropy": f"{flags} {ENTROPY}" for name, flags in MEMORIES.items()},
     **{f"{name}, refreshed": f"{flags} --refresh-memory" for name, flags in MEMORIES.items()},
     **{f"{name}, gradient": f"{MEMORIES[name]} --trxl-memory-gradient" for name in ("TrXL", "GTrXL")},
@@ -126,10 +127,10 @@ FULL = {
 }
 TASKS = SMALL | FULL
 SUITES = {
-    "small": (SMALL, ("no memory", "stack of 4", "stack of 16", "GRU", "TrXL", "TrXL --trxl-query-position")),
+    "small": (SMALL, ("no memory", "stack of 4", "stack of 16", "GRU", "TrXL", "TrXL, preset")),
     "full": (
         FULL,
-        ("no memory", "stack of 4", "stack of 16", "step encoding", *MEMORIES, "TrXL --trxl-query-position"),
+        ("no memory", "stack of 4", "stack of 16", "step encoding", *MEMORIES, "TrXL, preset"),
     ),
 }
 
