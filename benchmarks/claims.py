@@ -27,7 +27,7 @@ import learning
 from learning import TASKS, Task
 
 MORTAR_MAYHEM, MYSTERY_PATH = TASKS["mortar-mayhem"], TASKS["mystery-path"]
-ENDLESS = replace(TASKS["endless-mortar-mayhem"], total_timesteps=3_000_000)
+ENDLESS = TASKS["endless-mortar-mayhem"]
 COMMANDS_IN_VIEW = replace(
     MORTAR_MAYHEM,
     env_id="MortarMayhemB-Grid-v0",
@@ -40,7 +40,7 @@ ALL_IN_VIEW = Task(
 FEW_FRAMES = ("no memory", "stack of 4", "step encoding")
 # The thesis' learning rate is at its final value after a fifth of the training: of the steps of ENDLESS, unless
 # --steps-scale changes them.
-TO_1E_4, TO_1E_5 = "TrXL --anneal-steps 600000", "TrXL --anneal-steps 600000 --final-lr 1e-5"
+TO_1E_4, TO_1E_5 = "TrXL --anneal-steps 200000", "TrXL --anneal-steps 200000 --final-lr 1e-5"
 # Large steps are what the thesis suspects, and --target-kl would prevent them.
 NOT_NORMALIZED, NORMALIZED = "GRU --target-kl None", "GRU --target-kl None --norm-adv minibatch"
 
