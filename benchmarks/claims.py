@@ -205,8 +205,12 @@ def verdict(claim: Claim, higher: np.ndarray, lower: np.ndarray) -> str:
 def row(name: str, config: Config, plans: list[learning.Plan]) -> str:
     """Return a claim's row of the table, from the results of what was planned for it."""
     claim, numbers = CLAIMS[name], {}
+    results = [learning.result_of(config, plan) for plan in plans]
+    if None in results:
+        missing = f"not tested: {results.count(None)} of {len(results)} runs are missing"
+        return f"| {claim.section} | {claim.text} | `{name}` | | {missing} |"
     for agent in (*claim.higher, *claim.lower):
-        runs = [learning.result_of(config, plan) for plan in plans if plan.agent == agent]
+        runs = [run for run, plan in zip(results, plans, strict=True) if plan.agent == agent]
         numbers[agent] = np.array([claim.measure(claim.task, run) for run in runs])  # (R,)
     figures = "; ".join(f"{agent} {x.mean():.3g} ({x.min():.3g} to {x.max():.3g})" for agent, x in numbers.items())
     found = verdict(claim, *([numbers[agent] for agent in agents] for agents in (claim.higher, claim.lower)))
@@ -215,7 +219,7 @@ def row(name: str, config: Config, plans: list[learning.Plan]) -> str:
 
 
 def main(config: Config) -> None:
-    """Train what is missing, then print a row for each claim."""
+    """Train what is missing, then print a row for each claim. Raises SystemExit for names that are not in CLAIMS."""
     if unknown := [name for name in config.claims if name not in CLAIMS]:
         raise SystemExit(f"there is no claim {unknown[0]}; there are {', '.join(CLAIMS)}")
     plans = {}
@@ -223,7 +227,8 @@ def main(config: Config) -> None:
         claim = CLAIMS[name]
         runs = itertools.product((*claim.higher, *claim.lower), config.seeds)
         plans[name] = [learning.plan(config, claim.task, agent, seed) for agent, seed in runs]
-    learning.train_missing(config, [*itertools.chain(*plans.values())])
+    if not config.report:
+        learning.train_missing(config, [*itertools.chain(*plans.values())])
     print("| section | claim | name | mean of the seeds (lowest to highest) | verdict |\n|---|---|---|---|---|")
     for name in config.claims:
         print(row(name, config, plans[name]))

@@ -9,7 +9,8 @@ vector observations and small networks, and all see the same vectors, a frame st
 evaluations during training, on levels outside the training set (6.1.3).
 
 What a run reached is kept in a file of some KB in --results, which `evaluate.py --curves` can draw too. A run whose
-file is there is not trained again; one that was stopped goes on from its last checkpoint in --folder.
+file is there is not trained again; one that was stopped goes on from its last checkpoint in --folder. With --report,
+nothing is trained.
 """
 
 import contextlib
@@ -24,6 +25,7 @@ import signal
 import subprocess
 import sys
 import zlib
+from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
@@ -151,6 +153,8 @@ class Training:
     """where the runs go"""
     results: Path = Path("learning/results")
     """where a file of some KB goes for every finished run"""
+    report: bool = False
+    """train no further, show what there are results of"""
 
 
 @dataclass
@@ -341,8 +345,13 @@ def row(agent: str, runs: list[evaluate.RunLog], metric: str, best: float) -> st
     return f"| {agent} | {len(runs)} | {reached} | {' | '.join(taken)} | {minutes[-1]:.1f} |"
 
 
-def report(task: Task, runs: dict[str, list[evaluate.RunLog]]) -> None:
+def print_table(task: Task, all_runs: dict[str, list[evaluate.RunLog]]) -> None:
     """Print a task's table: the runs of each agent, one a seed, and on which machines they were trained."""
+    runs = {agent: each for agent, each in all_runs.items() if each}
+    if untrained := [agent for agent in all_runs if agent not in runs]:
+        print(f"\n{task.env_id} {json.dumps(task.options)}: no results of {'; '.join(untrained)}")
+    if not runs:
+        return
     curves = [evaluate.align([run.curves[f"eval/{task.metric}"] for run in each]) for each in runs.values()]
     best = max(evaluate.iqm(scores[-1]) for _, scores in curves)
     steps = int(next(iter(runs.values()))[0].args["total_timesteps"])
@@ -378,14 +387,19 @@ def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
 def main(config: Config) -> None:
     """Train what is missing, then print the tables and draw the curves.
 
-    Raises SystemExit as `plans_of` does, and for trainings that failed.
+    Raises SystemExit as `plans_of` does, for trainings that failed, and if there is nothing to show.
     """
     plans = plans_of(config)  # all at once: tyro, which parses their command lines, is not made for several threads
-    train_missing(config, [*plans.values()])
-    runs = {key: result_of(config, each) for key, each in plans.items()}
-    agents = dict.fromkeys(agent for _, agent, _ in plans)
-    for name in dict.fromkeys(task for task, _, _ in plans):
-        report(TASKS[name], {agent: [runs[name, agent, seed] for seed in config.seeds] for agent in agents})
+    if not config.report:
+        train_missing(config, [*plans.values()])
+    runs = {key: run for key, each in plans.items() if (run := result_of(config, each)) is not None}
+    if not runs:
+        raise SystemExit(f"{config.results} has no results of these agents; without --report they are trained")
+    tables = defaultdict(lambda: defaultdict(list))  # the runs by task and agent
+    for key in plans:
+        tables[key[0]][key[1]] += [runs[key]] if key in runs else []
+    for task, of_agents in tables.items():
+        print_table(TASKS[task], of_agents)
     evaluate.draw_curves(evaluate.Config(curves=tuple(run.path for run in runs.values()), out=str(config.out)))
 
 

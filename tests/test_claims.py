@@ -1,5 +1,7 @@
 """benchmarks/claims.py: its verdicts, and one claim from its trainings to its row."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -58,6 +60,11 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     assert told.splitlines()[-1].startswith(row + "; ".join(figures))
     claims.main(config)
     assert "trained" not in capsys.readouterr().out
+
+    claims.main(replace(config, report=True, seeds=(1, 2, 3)))
+    told = capsys.readouterr().out
+    assert "trained" not in told
+    assert told.count(" | not tested: 2 of 6 runs are missing |") == 2
 
 
 def test_unknown_claim():

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -99,6 +100,14 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     assert f"| {agent} | 1 |" in told
     assert f"\nMachines: {kept.machine}\n" in told
     assert config.out.with_suffix(".png").stat().st_size > 10_000
+
+    config = replace(config, report=True, agents=(agent, "LSTM"), seeds=(1, 2))
+    learning.main(config)
+    told = capsys.readouterr().out
+    assert ("trained" not in told, "no results of LSTM\n" in told, f"| {agent} | 1 |" in told) == (True, True, True)
+    assert not config.folder.exists() or not [*config.folder.iterdir()]
+    with pytest.raises(SystemExit, match="nowhere has no results of these agents; without --report they are trained"):
+        learning.main(replace(config, results=tmp_path / "nowhere"))
 
 
 def test_a_failed_run_stops_no_other(tmp_path, monkeypatch):
