@@ -11,7 +11,8 @@ A claim compares pairs of agents. It holds if, in all pairs, each seed of one ag
 does not hold if, in some pair, each is worse; otherwise, and with fewer than three seeds, it is not decided. Where the
 thesis says that agents are no better than others, that is contradicted if one is, with each of its seeds. With three
 seeds each, chance alone separates two equal agents in one of ten pairs, in each direction in one of twenty: among all
-of these claims, a few such verdicts are to be expected.
+of these claims, a few such verdicts are to be expected. With --report nothing is trained, and a claim is not tested if
+runs are missing.
 """
 
 import itertools

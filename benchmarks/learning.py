@@ -154,7 +154,7 @@ class Training:
     results: Path = Path("learning/results")
     """where a file of some KB goes for every finished run"""
     report: bool = False
-    """train no further, show what there are results of"""
+    """train nothing, show the results that are there"""
 
 
 @dataclass
