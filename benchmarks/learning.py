@@ -397,7 +397,8 @@ def main(config: Config) -> None:
         raise SystemExit(f"{config.results} has no results of these agents; without --report they are trained")
     tables = defaultdict(lambda: defaultdict(list))  # the runs by task and agent
     for key in plans:
-        tables[key[0]][key[1]] += [runs[key]] if key in runs else []
+        task, agent, _ = key
+        tables[task][agent] += [runs[key]] if key in runs else []
     for task, of_agents in tables.items():
         print_table(TASKS[task], of_agents)
     evaluate.draw_curves(evaluate.Config(curves=tuple(run.path for run in runs.values()), out=str(config.out)))
