@@ -10,13 +10,14 @@ steps of the training, are agents of their own. As in the thesis (6.1.2, 6.1.3),
 training set, three times each. An agent's score is the interquartile mean (IQM): the mean of the middle half of all
 episodes of its seeds, as the thesis pools 750 of them. Beside it stands the IQM of the levels' means, which is another
 number: where 70 % of the episodes succeed, the middle half has hardly a failure, but many a level has a mean below 1.
-The 95 % interval is a stratified bootstrap's over the seeds: how far the IQM would move with other seeds. A single seed
-cannot tell, and has none.
+The 95 % interval is that of a bootstrap that resamples whole seeds: how far the IQM would move with other seeds. Of
+three seeds it is no more than the range of their IQMs. A single seed has none.
 
 Shape letters: R seeds (training runs) of an agent, M levels, E episodes on each, I iterations of a run, P points of a
 curve, B bootstrap resamples.
 """
 
+import glob
 import gzip
 import itertools
 import json
@@ -126,9 +127,11 @@ def iqm(scores: np.ndarray) -> np.ndarray:
 def interval(scores: np.ndarray) -> np.ndarray | None:
     """Return the ends (2, ...) of the IQM's 95 % bootstrap interval for scores (..., R, M, E); None for a single seed.
 
-    Levels are the strata: a resample has R seeds on each. A drawn seed brings its scores on all levels along, for they
-    come from the same weights. To draw other seeds for each level is right where each has been trained on by itself;
-    here it makes the interval far too narrow wherever seeds differ, as benchmarks/interval_coverage.py shows.
+    Whole seeds are resampled (a cluster bootstrap): a drawn seed brings its scores on all levels along, for they come
+    from the same weights. To draw other seeds for each level is right where each has been trained on by itself; here it
+    makes the interval far too narrow wherever seeds differ, as benchmarks/interval_coverage.py shows. Of three seeds,
+    one of 27 resamples has the worst seed three times, more than 2.5 %: the ends are about the lowest and the highest
+    IQM of a seed.
     """
     seeds = scores.shape[-3]
     if seeds < 2:
@@ -283,6 +286,8 @@ def read_run(path: str) -> RunLog:
     events.Reload()
     tags = events.Tags()
     if not tags["scalars"] or "hyperparameters/text_summary" not in tags["tensors"]:
+        if glob.glob(f"{path}/*.json.gz"):
+            raise NoCurvesError(f"{path} is a folder of results; give the files themselves, as {path}/*.json.gz")
         raise NoCurvesError(f"{path} holds no curves of a training run")
     return RunLog(path, hyperparameters(events), event_curves(events))
 

@@ -1136,8 +1136,8 @@ def check_args(args: Args) -> None:
     longest, share = longest_piece(args), batch_size // processes
     if args.num_minibatches * longest > share:
         raise ValueError(
-            f"--num-minibatches is {args.num_minibatches}, but an iteration may have only {share // longest} "
-            f"pieces (up to {longest} of {share} steps each); use that many or shorter pieces"
+            f"--num-minibatches is {args.num_minibatches}, but an iteration may have only {share // longest} sequences "
+            f"(up to {longest} of {share} steps each); use at most that many, or more environments (--num-envs)"
         )
 
 

@@ -242,8 +242,8 @@ class Args:
     trxl_segment_length: PositiveInt = 128
     """steps of one environment that the update computes at once; minibatches are made of such segments"""
     trxl_memory_gradient: bool = False
-    """teach earlier steps of a segment what to leave for later ones: attend to their recomputed inputs, with
-    gradient"""
+    """let the gradient flow through the block inputs of a segment's earlier steps, computed again in the update, where
+    stored ones are detached"""
     trxl_init: Literal["xavier", "orthogonal", "kaiming", "tfixup"] = "xavier"
     """how the blocks' weights are initialized"""
     trxl_layer_norm: Literal["pre", "post"] = "pre"
@@ -1420,8 +1420,8 @@ def check_args(args: Args) -> None:
     longest, share = longest_piece(args), batch_size // processes
     if args.num_minibatches * longest > share:
         raise ValueError(
-            f"--num-minibatches is {args.num_minibatches}, but an iteration may have only {share // longest} "
-            f"pieces (up to {longest} of {share} steps each); use that many or shorter pieces"
+            f"--num-minibatches is {args.num_minibatches}, but an iteration may have only {share // longest} sequences "
+            f"(up to {longest} of {share} steps each); use at most that many, or more environments (--num-envs)"
         )
 
 

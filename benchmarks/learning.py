@@ -328,20 +328,20 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
 
 
 def row(agent: str, runs: list[evaluate.RunLog], metric: str, best: float) -> str:
-    """Return the agent's row: its last score, the largest fall, and what nine tenths of the best agent's score took.
+    """Return the agent's row: its last score, the largest drop, and what nine tenths of the best agent's score took.
 
-    A fall is how far a seed's mean is below an earlier one.
+    A drop is how far a seed's mean is below an earlier one.
     """
     steps, scores = evaluate.align([run.curves[f"eval/{metric}"] for run in runs])  # (P,), (P, R, M, E)
     minutes = 60 * np.mean([run.hours(steps) for run in runs], 0)  # (P,), without evaluations
     ends = evaluate.interval(scores[-1])
     means = scores.mean((-2, -1))  # (P, R)
-    fall = (np.maximum.accumulate(means) - means).max()
+    drop = (np.maximum.accumulate(means) - means).max()
     middle = evaluate.iqm(scores)  # (P,)
     near = np.flatnonzero(middle >= 0.9 * best) if best > 0 else np.array([])
     taken = (f"{steps[near[0]]:,.0f}", f"{minutes[near[0]]:.1f}") if near.size else ("never", "")
     span = "none: one seed" if ends is None else "{:.2f} to {:.2f}".format(*ends)
-    reached = f"{scores[-1].mean():.2f} | {middle[-1]:.2f} | {span} | {fall:.2f}"
+    reached = f"{scores[-1].mean():.2f} | {middle[-1]:.2f} | {span} | {drop:.2f}"
     return f"| {agent} | {len(runs)} | {reached} | {' | '.join(taken)} | {minutes[-1]:.1f} |"
 
 
@@ -356,7 +356,7 @@ def print_table(task: Task, all_runs: dict[str, list[evaluate.RunLog]]) -> None:
     best = max(evaluate.iqm(scores[-1]) for _, scores in curves)
     steps = int(next(iter(runs.values()))[0].args["total_timesteps"])
     print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {steps:,} steps\n")
-    print("| agent | seeds | mean | IQM | 95 % interval | largest fall | steps to 0.9 of the best | minutes | in all |")
+    print("| agent | seeds | mean | IQM | 95 % interval | largest drop | steps to 0.9 of the best | minutes | in all |")
     print("|---|---:|---:|---:|---|---:|---:|---:|---:|")
     for agent, each in runs.items():
         print(row(agent, each, task.metric, float(best)))

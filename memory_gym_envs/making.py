@@ -7,6 +7,7 @@ Shape letters: N lanes, A action branches, H, W and C of a picture, V of a vecto
 """
 
 import contextlib
+import difflib
 import importlib
 import json
 import sys
@@ -185,10 +186,15 @@ def describe(parts: list[Saved]) -> dict[str, Any]:
 
 
 def find_spec(env_id: str) -> EnvSpec:
-    """What is registered for the id, or for "module:id" once the module is imported."""
+    """What is registered for the id, or for "module:id" once the module is imported.
+
+    Raises ImportError for a module that is not installed, gymnasium.error.Error for an id that is not registered.
+    """
     module, _, name = env_id.rpartition(":")
     if module:
         importlib.import_module(module)
+    if name not in gym.registry and (near := difflib.get_close_matches(name, gym.registry, n=1)):
+        raise gym.error.NameNotFound(f"there is no environment {name}; the nearest is {near[0]}")
     return gym.spec(name)
 
 

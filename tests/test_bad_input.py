@@ -15,7 +15,9 @@ import ppo_trxl
 
 SCRIPT = os.path.abspath(ppo_gru.__file__)
 CASES = {
-    "--env-id MortarMayhm-v0": "MortarMayhem",
+    "--env-id MortarMayhm-v0": "there is no environment MortarMayhm-v0; the nearest is MortarMayhem-v0",
+    "--env-id MortarMayhem-Grid": "the nearest is MortarMayhem-Grid-v0",
+    "--env-id zzz": "zzz",
     "--env-id nowhere:Env-v0": "nowhere",
     "--env-id Pendulum-v1": "action space .* is not supported; use Discrete",
     "--env-options {broken": "--env-options is no JSON",
@@ -32,8 +34,8 @@ CASES = {
     "--clip-coef 0": "--clip-coef is 0.0; it must be above 0",
     "--target-kl -1": "--target-kl is -1.0; it must be above 0",
     "--total-timesteps 100": "--total-timesteps is 100, less than one iteration of 16384 steps",
-    "--num-minibatches 64": "--num-minibatches is 64, but an iteration may have only 32 pieces",
-    "--num-minibatches 200 --seq-len 100": "may have only 163 pieces",
+    "--num-minibatches 64": "--num-minibatches is 64, but an iteration may have only 32 sequences",
+    "--num-minibatches 200 --seq-len 100": "may have only 163 sequences",
     "--seed 99999999999999999999": r"--seed is 99999999999999999999; it must be below 2 \*\* 63",
     "--exp-name ../up": "--exp-name is '../up'; it must be a name without slashes",
     "--env-id CueRecall-v0 --capture-video": "needs an environment that draws pictures .*; CueRecall-v0 draws none",
@@ -48,7 +50,7 @@ TRANSFORMER_CASES = {
     "--trxl-dim 9 --trxl-num-heads 3": "--trxl-dim is 9; it must be even",
     "--trxl-memory-length 0": "--trxl-memory-length is 0; it must be 1 or more",
     "--trxl-gate-bias inf": "--trxl-gate-bias is inf; it must be a finite number",
-    "--num-minibatches 200": "may have only 128 pieces .* or shorter pieces",
+    "--num-minibatches 200": "may have only 128 sequences .* at most that many, or more environments",
 }
 
 

@@ -548,6 +548,7 @@ BAD = {
     "MODEL --metrics coins": "not every episode told coins; they told return, length, reward",
     "--curves nowhere": "there is no run folder nowhere",
     "--curves empty": "empty holds no curves",
+    "--curves results": "results is a folder of results; give the files themselves, as results/\\*.json.gz",
     "--curves RUN --metrics coins": "no curve of coins in common; they all have .*eval/success",
     "--curves RUN --out no/where": "there is no folder no to write to",
     "--curves old --over time": "old has no charts/seconds_iteration, .*; draw it --over steps, or leave it out",
@@ -557,6 +558,8 @@ BAD = {
 def test_bad_input(agents, tmp_path):
     (tmp_path / "notes.txt").write_text("some notes")
     (tmp_path / "empty").mkdir()
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results/run.json.gz").touch()
     write_old_events("old", 1)
     for line, fault in BAD.items():
         words = line.replace("MODEL", f"{agents[0]}/model.pt --levels 1").replace("RUN", agents[0]).split()
