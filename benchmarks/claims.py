@@ -3,9 +3,10 @@
     python benchmarks/claims.py --results benchmarks/results
     python benchmarks/claims.py --claims query-position gate-bias
 
-The thesis trained for up to 819 million steps from pixels. Here networks are small, observations are vectors, and tasks
-take minutes, as in benchmarks/learning.py, whose runs and results these are; so a verdict is about these tasks. In
-Mystery Path, transformers have no positional encoding, as there.
+The thesis trained for up to 819 million steps from pixels. Here networks are small, observations are vectors, and a
+training takes minutes, up to an hour in the three longer endless tasks, as in benchmarks/learning.py, whose runs and
+results these are; so a verdict is about these tasks. In the small Mystery Path, transformers have no positional
+encoding, as there.
 
 A claim compares pairs of agents. It holds if, in all pairs, each seed of one agent is better than each of the other; it
 does not hold if, in some pair, each is worse; otherwise, and with fewer than three seeds, it is not decided. Where the
@@ -29,6 +30,9 @@ from learning import TASKS, Task
 
 MORTAR_MAYHEM, MYSTERY_PATH = TASKS["mortar-mayhem"], TASKS["mystery-path"]
 ENDLESS = TASKS["endless-mortar-mayhem"]
+LONG_ENDLESS = replace(ENDLESS, total_timesteps=12_000_000)
+ENDLESS_MYSTERY_PATH = replace(TASKS["Endless-MysteryPath-v0"], total_timesteps=3_000_000)
+ENDLESS_SPOTLIGHTS = replace(TASKS["Endless-SearingSpotlights-v0"], total_timesteps=3_000_000)
 COMMANDS_IN_VIEW = replace(
     MORTAR_MAYHEM,
     env_id="MortarMayhemB-Grid-v0",
@@ -39,6 +43,8 @@ ALL_IN_VIEW = Task(
     "SearingSpotlights-v0", 1_000_000, dict.fromkeys(("agent_visible", "coins_visible", "exit_visible"), True)
 )
 FEW_FRAMES = ("no memory", "stack of 4", "step encoding")
+# With about as many parameters as the GRU.
+WIDE = "TrXL --trxl-query-position --trxl-dim 96 --trxl-memory-length 256 --init-lr 5e-4"
 # The thesis' learning rate is at its final value after a fifth of the training: of the steps of ENDLESS, unless
 # --steps-scale changes them.
 TO_1E_4, TO_1E_5 = "TrXL --anneal-steps 200000", "TrXL --anneal-steps 200000 --final-lr 1e-5"
@@ -134,6 +140,15 @@ CLAIMS = {
     ),
     "endless": Claim(
         "6.3", "GRU completes more commands than TrXL in Endless Mortar Mayhem", ENDLESS, ("GRU",), ("TrXL",)
+    ),
+    "endless-long": Claim(
+        "6.3", "the same with as many parameters, after 12 million steps", LONG_ENDLESS, ("GRU",), (WIDE,)
+    ),
+    "endless-mystery-path": Claim(
+        "6.3", "GRU has a higher return than TrXL in Endless Mystery Path", ENDLESS_MYSTERY_PATH, ("GRU",), (WIDE,)
+    ),
+    "endless-spotlights": Claim(
+        "6.3", "GRU collects more coins than TrXL in Endless Searing Spotlights", ENDLESS_SPOTLIGHTS, ("GRU",), (WIDE,)
     ),
     "falls": Claim(
         "6.5.2", "TrXL falls off less often than GRU in Mystery Path", MYSTERY_PATH, ("GRU",), ("TrXL",), falls
