@@ -1,12 +1,15 @@
 """benchmarks/claims.py: its verdicts, and one claim from its trainings to its row."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import claims
 import learning
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize(
@@ -65,6 +68,12 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     told = capsys.readouterr().out
     assert "trained" not in told
     assert told.count(" | not tested: 2 of 6 runs are missing |") == 2
+
+
+def test_the_page_has_the_rows_of_the_results_that_are_there(capsys):
+    claims.main(claims.Config(report=True, results=ROOT / "benchmarks/results"))
+    page = (ROOT / "docs/claims.md").read_text().splitlines()
+    assert not [row for row in capsys.readouterr().out.splitlines() if row not in page]
 
 
 def test_unknown_claim():
