@@ -146,7 +146,7 @@ class Training:
     seeds: tuple[int, ...] = (1, 2, 3)
     """a training run each"""
     jobs: int = os.cpu_count() or 1
-    """runs at the same time; they share the cores"""
+    """runs at the same time; they share the cores, or have OMP_NUM_THREADS threads each if that is set"""
     evaluations: int = 20
     """points of a curve"""
     folder: Path = Path("learning")
@@ -251,7 +251,7 @@ def train(config: Training, plan: Plan) -> None:
     threads = str(max(1, (os.cpu_count() or 1) // config.jobs))
     task_hash = zlib.crc32(json.dumps(asdict(plan.task)).encode())
     log = config.folder / f"{plan.task.env_id}-{file_name(plan.agent)}-{plan.seed}-{task_hash:08x}.log"
-    environment = {**os.environ, "OMP_NUM_THREADS": threads, "TQDM_MININTERVAL": "10"}
+    environment = {"OMP_NUM_THREADS": threads, **os.environ, "TQDM_MININTERVAL": "10"}
     with log.open("a") as output:
         # In a session of its own, Ctrl-C does not reach it: `train_missing` stops it, so that it leaves a checkpoint.
         how = {"cwd": config.folder, "env": environment, "stdout": output, "stderr": output, "start_new_session": True}

@@ -125,6 +125,20 @@ def test_a_failed_run_stops_no_other(tmp_path, monkeypatch):
     assert done == [1, 2]
 
 
+def test_runs_share_the_cores_unless_told_how_many_threads_to_have(tmp_path, monkeypatch):
+    config = learning.Config(jobs=1, folder=tmp_path)
+    plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", 1)
+    plan = replace(plan, command=(sys.executable, "-c", "import os; print(os.environ['OMP_NUM_THREADS'])"))
+    monkeypatch.setattr(os, "cpu_count", lambda: 7)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    learning.train(config, plan)
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    learning.train(config, plan)
+    learning.train(replace(config, jobs=2), plan)
+    (log,) = tmp_path.glob("*.log")
+    assert log.read_text() == "3\n7\n3\n"
+
+
 def test_a_row_of_the_table():
     def run(*means):
         steps = np.array([100, 200, 300])
