@@ -312,7 +312,9 @@ def kind(args: Any) -> str:
     """Name the agent's memory."""
     if hasattr(args, "memory"):
         return {"gru": "GRU", "lstm": "LSTM", "none": "no memory"}[args.memory]
-    return "GTrXL" if args.trxl_gate == "gru" else "TrXL"
+    if hasattr(args, "trxl_gate"):
+        return "GTrXL" if args.trxl_gate == "gru" else "TrXL"
+    return args.exp_name
 
 
 def summary(episode: Episode, args: Any, seed: int) -> dict[str, Any]:

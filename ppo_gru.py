@@ -569,7 +569,8 @@ class Decoder(nn.Sequential):
 #   logs                           numbers for TensorBoard
 #   not_saved                      fields of the state that no checkpoint holds
 #   width                          D, the width of what comes out
-# Section 1 has what is known before it is made: its flags, NETWORK_FLAGS, memory_width and longest_piece.
+# Section 1 has what is known before it is made: its flags, those in PRESETS and NETWORK_FLAGS, memory_width and
+# longest_piece.
 class MemoryState(NamedTuple):
     """What N environments remember. `t` and `hidden` are replaced step by step, `stored` is written in place."""
 

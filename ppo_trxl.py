@@ -609,7 +609,8 @@ class Decoder(nn.Sequential):
 #   logs                           numbers for TensorBoard
 #   not_saved                      fields of the state that no checkpoint holds
 #   width                          D, the width of what comes out
-# Section 1 has what is known before it is made: its flags, NETWORK_FLAGS, memory_width and longest_piece.
+# Section 1 has what is known before it is made: its flags, those in PRESETS and NETWORK_FLAGS, memory_width and
+# longest_piece.
 def visible(age: Tensor, episode_step: Tensor, window: int) -> Tensor:
     """Return whether a query at this step of its episode sees the item that was stored `age` steps before it.
 

@@ -132,7 +132,7 @@ SUITES = {
     "small": (SMALL, ("no memory", "stack of 4", "stack of 16", "GRU", "TrXL", "TrXL, preset")),
     "full": (
         FULL,
-        ("no memory", "stack of 4", "stack of 16", "step encoding", *MEMORIES, "TrXL, preset"),
+        ("no memory", "stack of 4", "stack of 16", "step encoding", "GRU", "LSTM", "TrXL", "GTrXL", "TrXL, preset"),
     ),
 }
 

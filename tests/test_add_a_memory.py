@@ -41,7 +41,7 @@ def follow(folder):
 
 
 def test_the_memory_of_the_page(tmp_path):
-    assert (len(REPLACED), len(ADDED)) == (3, 4)
+    assert (len(REPLACED), len(ADDED)) == (3, 5)
     follow(tmp_path)
 
     def python(*command):
@@ -52,8 +52,9 @@ def test_the_memory_of_the_page(tmp_path):
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    told = python("-m", "pytest", "-p", "no:cacheprovider", "tests/test_memory.py", "-k", "mingru")
-    assert int(re.search(r"(\d+) passed", told).group(1)) >= 14
+    tests = ("tests/test_memory.py", "tests/test_resume.py", "-k", "mingru")
+    told = python("-m", "pytest", "-p", "no:cacheprovider", *tests)
+    assert int(re.search(r"(\d+) passed", told).group(1)) >= 19
     few = ["--seeds", "1", "--steps-scale", "0.01", "--evaluations", "1"]
     assert "| minGRU | 1 |" in python("benchmarks/learning.py", "--tasks", "mortar-mayhem", "--agents", "minGRU", *few)
     (model,) = tmp_path.glob("learning/runs/*/model.pt")
