@@ -29,11 +29,10 @@ import learning
 from learning import TASKS, Task
 
 MORTAR_MAYHEM, MYSTERY_PATH = TASKS["mortar-mayhem"], TASKS["mystery-path"]
-FULL_MORTAR_MAYHEM = replace(TASKS["MortarMayhem-Grid-v0"], total_timesteps=6_000_000)
+FULL_MORTAR_MAYHEM = TASKS["MortarMayhem-Grid-v0"]
 ENDLESS = TASKS["endless-mortar-mayhem"]
 LONG_ENDLESS = replace(ENDLESS, total_timesteps=12_000_000)
-ENDLESS_MYSTERY_PATH = replace(TASKS["Endless-MysteryPath-v0"], total_timesteps=3_000_000)
-ENDLESS_SPOTLIGHTS = replace(TASKS["Endless-SearingSpotlights-v0"], total_timesteps=3_000_000)
+ENDLESS_MYSTERY_PATH, ENDLESS_SPOTLIGHTS = TASKS["Endless-MysteryPath-v0"], TASKS["Endless-SearingSpotlights-v0"]
 COMMANDS_IN_VIEW = replace(
     MORTAR_MAYHEM,
     env_id="MortarMayhemB-Grid-v0",
@@ -44,9 +43,7 @@ ALL_IN_VIEW = Task(
     "SearingSpotlights-v0", 1_000_000, dict.fromkeys(("agent_visible", "coins_visible", "exit_visible"), True)
 )
 FEW_FRAMES = ("no memory", "stack of 4", "step encoding")
-# With about as many parameters as the GRU.
-WIDE_FLAGS = "--trxl-dim 96 --trxl-memory-length 256 --init-lr 5e-4"
-WIDE, WIDE_PRESET = f"TrXL --trxl-query-position {WIDE_FLAGS}", f"TrXL, preset {WIDE_FLAGS}"
+WIDE, WIDE_PRESET = f"TrXL --trxl-query-position {learning.WIDE}", f"TrXL, preset {learning.WIDE}"
 # The thesis' learning rate is at its final value after a fifth of the training: of the steps of ENDLESS, unless
 # --steps-scale changes them.
 TO_1E_4, TO_1E_5 = "TrXL --anneal-steps 200000", "TrXL --anneal-steps 200000 --final-lr 1e-5"
