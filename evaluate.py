@@ -30,6 +30,7 @@ import zlib
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
@@ -512,6 +513,7 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
         if any("wall_time" in each for each in summaries):
             print(f"{title}, seconds of an iteration and hours of a training\n\n{time_table(summaries)}\n")
     figure.draw_without_rendering()  # the layout changes the ticks, and these the layout
+    Path(config.out).parent.mkdir(parents=True, exist_ok=True)
     for name in (f"{config.out}.png", f"{config.out}.svg"):
         figure.savefig(name, dpi=150)
     return report

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import subprocess
 import sys
 import xml.etree.ElementTree
@@ -313,6 +314,15 @@ def test_the_levels_of_an_older_run():
         writer.add_tensor("eval_levels/return", torch.tensor([[1.0, 2.0], [3.0, 4.0]]), 20)
     steps, scores = evaluate.read_run("old").curves["eval/return"]
     assert (steps.tolist(), scores.tolist()) == ([10, 20], [[[1], [3]], [[1.5], [3.5]]])
+
+
+def test_a_picture_goes_to_a_folder_that_is_not_there_yet():
+    with SummaryWriter("run-1") as writer:
+        writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|1|\n|env_id|A-v0|\n|eval_repeats|2|")
+        writer.add_scalar("eval/return", 1.0, 10)
+        writer.add_tensor("eval_levels/return", torch.tensor([[1.0, 2.0]]), 10)
+    evaluate.draw_curves(evaluate.Config(curves=("run-1",), out="new/curves"))
+    assert os.path.exists("new/curves.png")
 
 
 def test_a_table_says_whose_episodes_were_not_kept(capsys):
