@@ -49,6 +49,7 @@ try:
     from matplotlib import color_sequences
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
     from matplotlib.ticker import EngFormatter, StrMethodFormatter
     from scipy.stats import trim_mean
 except ImportError as error:
@@ -401,25 +402,80 @@ def align(runs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.nda
     return common, np.moveaxis(stack_scores(latest), 0, 1)
 
 
-def draw_metric(axis: Axes, name: str, agents: dict[str, list[RunLog]], over: str = "steps") -> dict[str, np.ndarray]:
+def draw_metric(
+    axis: Axes, name: str, agents: dict[str, list[RunLog]], styles: dict[str, dict], over: str = "steps"
+) -> dict[str, np.ndarray]:
     """Draw a curve of every agent, its runs by label, over steps or time; return each one's last scores (R, M, E)."""
     last = {}
-    for (label, runs), color in zip(agents.items(), itertools.cycle(color_sequences["petroff10"]), strict=False):
+    for label, runs in agents.items():
         curves = [run.curves[name] for run in runs]
         if over == "time":
             curves = [(run.hours(steps), values) for run, (steps, values) in zip(runs, curves, strict=True)]
         x, scores = align(curves)
         marker = "o" if len(x) == 1 else None  # a line of one point is not to be seen
-        seeds = f"{len(runs)} seed{'s' * (len(runs) > 1)}"
-        axis.plot(x, iqm(scores), color=color, marker=marker, label=f"{textwrap.fill(label, LABEL_WIDTH)}, {seeds}")
+        axis.plot(x, iqm(scores), marker=marker, **styles[label])
         if len(runs) > 1:
             band = np.stack([interval(point) for point in scores], axis=-1)  # (2, P); one after the other saves memory
-            axis.fill_between(x, *band, color=color, alpha=0.2, linewidth=0)
+            axis.fill_between(x, *band, color=styles[label]["color"], alpha=0.2, linewidth=0)
         last[label] = scores[-1]
     axis.set(xlabel="steps" if over == "steps" else "hours of training", ylabel=name)
     # 2 M steps are 2,000,000, but 20 m hours would be 0.02.
     axis.xaxis.set_major_formatter(EngFormatter(sep=" ") if over == "steps" else StrMethodFormatter("{x:g}"))
     axis.grid(alpha=0.3)
+    return last
+
+
+def blank_pictures(tasks: int, metrics: int) -> tuple[Figure, np.ndarray]:
+    """Return a figure and its axes (tasks, metrics): tasks side by side, or with several metrics below each other."""
+    across = min(tasks, 2 if tasks <= 4 else 3) if metrics == 1 else 1
+    down = math.ceil(tasks / across)
+    figure = Figure(figsize=(5.5 * across * metrics, 3.8 * down), layout="constrained")
+    grid = figure.subplots(down, across * metrics, squeeze=False).reshape(-1, metrics)
+    for axis in grid[tasks:].flat:
+        axis.remove()
+    return figure, grid[:tasks]
+
+
+def add_legend(figure: Figure, tasks: dict[str, dict[str, list[RunLog]]], styles: dict[str, dict]) -> None:
+    """Add one legend for all tasks below their pictures, with the number of each agent's seeds."""
+    lines, texts = [], []
+    for label in styles:
+        counts = sorted(len(agents[label]) for agents in tasks.values() if label in agents)
+        if counts:
+            span = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
+            lines.append(Line2D([], [], **styles[label]))
+            texts.append(f"{textwrap.fill(label, LABEL_WIDTH)}, {span} seed{'s' * (counts[-1] > 1)}")
+    widest = 0.8 + 0.085 * max(len(line) for text in texts for line in text.splitlines())  # inches
+    columns = max(1, int(figure.get_figwidth() / widest))
+    figure.set_figheight(figure.get_figheight() + 0.22 * sum(text.count("\n") + 1 for text in texts) / columns)
+    figure.legend(lines, texts, loc="outside lower left", ncols=columns, frameon=False)
+
+
+def draw_tasks(
+    tasks: dict[str, dict[str, list[RunLog]]], out: str, metrics: tuple[str, ...] = (), over: str = "steps"
+) -> dict[str, dict[str, dict[str, np.ndarray]]]:
+    """Draw each task and metric to OUT.png and OUT.svg; tasks: the runs, if any, by the task's title and agent's label.
+
+    Without metrics, the family's own. Return the last scores (R, M, E) by title, label and name of the curve.
+    """
+    labels = dict.fromkeys(itertools.chain(*tasks.values()))  # also of agents without runs: others keep their colours
+    looks = itertools.cycle(itertools.product(("-", "--", ":"), color_sequences["petroff10"]))
+    styles = {label: {"linestyle": line, "color": color} for label, (line, color) in zip(labels, looks, strict=False)}
+    tasks = {title: {label: runs for label, runs in agents.items() if runs} for title, agents in tasks.items()}
+    figure, grid = blank_pictures(len(tasks), len(metrics) or 1)
+    last = defaultdict(lambda: defaultdict(dict))
+    for axes, (title, agents) in zip(grid, tasks.items(), strict=True):
+        every_run = list(itertools.chain(*agents.values()))
+        for axis, metric in zip(axes, metrics or [own_metric(every_run[0].args["env_id"])], strict=True):
+            name = curve_name(metric, every_run)
+            for label, scores in draw_metric(axis, name, agents, styles, over).items():
+                last[title][label][name] = scores
+        axes[0].set_title(textwrap.fill(title, 55 * len(axes)), loc="left", fontsize="medium")
+    add_legend(figure, tasks, styles)
+    figure.draw_without_rendering()  # the layout changes the ticks, and these the layout
+    Path(out).parent.mkdir(parents=True, exist_ok=True)
+    for name in (f"{out}.png", f"{out}.svg"):
+        figure.savefig(name, dpi=150)
     return last
 
 
@@ -479,43 +535,25 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
     Wall times are printed and returned of the agents whose runs all have them.
     """
     runs_by_path = read_runs(config)
-    tasks = tasks_of({path: run.args for path, run in runs_by_path.items()}, task_of)
-    metrics = len(config.metrics) or 1
-    across = min(len(tasks), 2) if metrics == 1 else 1  # tasks side by side
-    down = math.ceil(len(tasks) / across)
-    lines = max(sum(len(textwrap.wrap(label, LABEL_WIDTH)) for label in agents) for agents in tasks.values())
-    legend = 0.22 * lines  # inches below the curves
-    figure = Figure(figsize=(5.5 * across * metrics, (3.8 + legend) * down), layout="constrained")
-    grid = figure.subplots(down, across * metrics, squeeze=False).reshape(-1, metrics)  # a task's pictures a row
-    for axis in grid[len(tasks) :].flat:
-        axis.remove()
+    paths = tasks_of({path: run.args for path, run in runs_by_path.items()}, task_of)
+    tasks = {
+        title: {label: [runs_by_path[path] for path in members] for label, members in agents.items()}
+        for title, agents in paths.items()
+    }
+    last = draw_tasks(tasks, config.out, config.metrics, config.over)
     report = []
-    for axes, (title, agents) in zip(grid, tasks.items(), strict=False):
-        runs = {label: [runs_by_path[path] for path in paths] for label, paths in agents.items()}
-        last, is_incomplete = defaultdict(dict), False
-        env_id = next(run.args["env_id"] for members in runs.values() for run in members)
-        for axis, metric in zip(axes, config.metrics or [own_metric(env_id)], strict=True):
-            every_run = list(itertools.chain(*runs.values()))
-            name = curve_name(metric, every_run)
-            is_incomplete |= any(lacks_episodes(run, name) for run in every_run)
-            for label, scores in draw_metric(axis, name, runs, config.over).items():
-                last[label][name] = scores
-        axes[0].set_title(textwrap.fill(title, 55 * metrics), loc="left", fontsize="medium")
-        axes[0].legend(loc="upper left", bbox_to_anchor=(0, -0.17), frameon=False)  # below, clear of the curves
-        summaries = [summary(label, agents[label], last[label]) for label in agents]
+    for title, agents in tasks.items():
+        summaries = [summary(label, paths[title][label], last[title][label]) for label in agents]
         for each in summaries:
-            if all(run.has_seconds() for run in runs[each["agent"]]):
-                each["wall_time"] = wall_time(runs[each["agent"]])
+            if all(run.has_seconds() for run in agents[each["agent"]]):
+                each["wall_time"] = wall_time(agents[each["agent"]])
         report.append({"task": title, "agents": summaries})
         print(f"{title}, where the curves end\n\n{table(summaries)}\n")
-        if is_incomplete:
+        names = next(iter(last[title].values()))  # of the curves, the same for all agents
+        if any(lacks_episodes(run, name) for run in itertools.chain(*agents.values()) for name in names):
             print("earlier versions kept the levels' means only: the IQM of runs that they trained is that of these\n")
         if any("wall_time" in each for each in summaries):
             print(f"{title}, seconds of an iteration and hours of a training\n\n{time_table(summaries)}\n")
-    figure.draw_without_rendering()  # the layout changes the ticks, and these the layout
-    Path(config.out).parent.mkdir(parents=True, exist_ok=True)
-    for name in (f"{config.out}.png", f"{config.out}.svg"):
-        figure.savefig(name, dpi=150)
     return report
 
 

@@ -77,6 +77,11 @@ class Task:
     trxl_flags: str = ""  # the transformer's own
 
     @property
+    def title(self) -> str:
+        """Return the environment's id, and the reset options if they are not the default ones."""
+        return f"{self.env_id} {json.dumps(self.options)}" if self.options else self.env_id
+
+    @property
     def metric(self) -> str:
         """Return the name of the family's own metric (6.1.3)."""
         return evaluate.own_metric(self.env_id)
@@ -140,14 +145,15 @@ FULL = {  # trained for what two cores can do in a day, all agents and seeds tog
 # A transformer with about as many parameters as the GRU.
 WIDE = "--trxl-dim 96 --trxl-memory-length 256 --init-lr 5e-4"
 TASKS = SMALL | FULL
-SUITES = {
-    "small": (SMALL, ("no memory", "stack of 4", "stack of 16", "GRU", "TrXL", "TrXL, preset")),
+SUITES = {  # tasks, and agents by the names that tables and pictures have for them
+    "small": (
+        SMALL,
+        {name: name for name in ("no memory", "stack of 4", "stack of 16", "GRU", "TrXL", "TrXL, preset")},
+    ),
     "full": (
         FULL,
-        (
-            *("no memory", "stack of 4", "stack of 16", "step encoding", "GRU", "LSTM"),
-            *(f"{name} {WIDE}" for name in ("TrXL", "GTrXL", "TrXL, preset")),
-        ),
+        {name: name for name in ("no memory", "stack of 4", "stack of 16", "step encoding", "GRU", "LSTM")}
+        | {name: f"{name} {WIDE}" for name in ("TrXL", "GTrXL", "TrXL, preset")},
     ),
 }
 
@@ -356,48 +362,84 @@ def row(agent: str, runs: list[evaluate.RunLog], metric: str, best: float) -> st
     middle = evaluate.iqm(scores)  # (P,)
     near = np.flatnonzero(middle >= 0.9 * best) if best > 0 else np.array([])
     taken = (f"{steps[near[0]]:,.0f}", f"{minutes[near[0]]:.1f}") if near.size else ("never", "")
-    span = "none: one seed" if ends is None else "{:.2f} to {:.2f}".format(*ends)
-    reached = f"{scores[-1].mean():.2f} | {middle[-1]:.2f} | {span} | {drop:.2f}"
-    return f"| {agent} | {len(runs)} | {reached} | {' | '.join(taken)} | {minutes[-1]:.1f} |"
+    span = "one seed" if ends is None else "{:.2f} to {:.2f}".format(*ends)
+    each_seed = ", ".join(f"{mean:.2f}" for mean in means[-1])
+    reached = f"{each_seed} | {scores[-1].mean():.2f} | {middle[-1]:.2f} | {span} | {drop:.2f}"
+    return f"| {agent} | {reached} | {' | '.join(taken)} | {minutes[-1]:.1f} |"
 
 
-def print_table(task: Task, all_runs: dict[str, list[evaluate.RunLog]]) -> None:
-    """Print a task's table: the runs of each agent, one a seed, and on which machines they were trained."""
-    runs = {agent: each for agent, each in all_runs.items() if each}
-    if untrained := [agent for agent in all_runs if agent not in runs]:
-        print(f"\n{task.env_id} {json.dumps(task.options)}: no results of {'; '.join(untrained)}")
-    if not runs:
-        return
-    curves = [evaluate.align([run.curves[f"eval/{task.metric}"] for run in each]) for each in runs.values()]
-    best = max(evaluate.iqm(scores[-1]) for _, scores in curves)
-    steps = int(next(iter(runs.values()))[0].args["total_timesteps"])
-    print(f"\n{task.env_id} {json.dumps(task.options)}, {task.metric} after {steps:,} steps\n")
-    print("| agent | seeds | mean | IQM | 95 % interval | largest drop | steps to 0.9 of the best | minutes | in all |")
-    print("|---|---:|---:|---:|---|---:|---:|---:|---:|")
-    for agent, each in runs.items():
-        print(row(agent, each, task.metric, float(best)))
-    machines = dict.fromkeys(run.machine for each in runs.values() for run in each)
-    print(f"\nMachines: {'; '.join(machines)}")
+def last_scores(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
+    """Return the scores (R, M, E) of an agent's seeds at the end of training."""
+    return evaluate.align([run.curves[f"eval/{task.metric}"] for run in runs])[1][-1]
+
+
+def table(task: Task, agents: dict[str, list[evaluate.RunLog]]) -> str:
+    """Return a task's table, a row for each agent that has runs, and below it what these took and on which machines."""
+    runs_of = {agent: runs for agent, runs in agents.items() if runs}
+    best = max(float(evaluate.iqm(last_scores(task, runs))) for runs in runs_of.values())
+    every_run = [run for runs in runs_of.values() for run in runs]
+    hours = sum(run.seconds("iteration").sum() for run in every_run) / 3600
+    machines = "; ".join(dict.fromkeys(run.machine for run in every_run))
+    reached = ("agent", "each seed", "mean", "IQM", "95 % interval", "largest drop")
+    lines = [
+        f"{task.metric} after {int(every_run[0].args['total_timesteps']):,} steps\n",
+        f"| {' | '.join(reached)} | steps to 0.9 of the best | minutes | in all |",
+        "|---|---|---:|---:|---|---:|---:|---:|---:|",
+        *(row(agent, runs, task.metric, best) for agent, runs in runs_of.items()),
+        f"\nRuns: {len(every_run)}, {hours:.1f} hours without evaluations. Machines: {machines}",
+    ]
+    return "\n".join(lines)
+
+
+def overview(tasks: dict[str, dict[str, list[evaluate.RunLog]]]) -> str:
+    """Return a table with a row for each task: the IQM of each agent at the end of training, and its mean in brackets.
+
+    Where an agent has fewer seeds than others, it says how many; where it has none, there is no number.
+    """
+    names = [*dict.fromkeys(agent for agents in tasks.values() for agent in agents)]
+    most = max(len(runs) for agents in tasks.values() for runs in agents.values())
+
+    def cell(task: Task, runs: list[evaluate.RunLog]) -> str:
+        if not runs:
+            return ""
+        scores = last_scores(task, runs)
+        few = f", {len(runs)} seed{'s' * (len(runs) > 1)}" if len(runs) < most else ""
+        return f"{evaluate.iqm(scores):.2f} ({scores.mean():.2f}){few}"
+
+    lines = [f"| task, metric | {' | '.join(names)} |", f"|---|{'---:|' * len(names)}"]
+    for name, agents in tasks.items():
+        cells = [cell(TASKS[name], runs) for runs in agents.values()]
+        lines.append(f"| {name}, {TASKS[name].metric} | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
-    """Return the trainings that are wanted, by task, agent and seed.
+    """Return the trainings that are wanted, by task, the agent's name in tables, and seed.
 
     Raises SystemExit for names that this program does not know, no seed, and what cannot be planned.
     """
     suite_tasks, suite_agents = SUITES[config.suite]
-    tasks, agents = config.tasks or suite_tasks, config.agents or suite_agents
+    tasks, agents = config.tasks or suite_tasks, {agent: agent for agent in config.agents} or suite_agents
     if not config.seeds:
         raise SystemExit("--seeds is empty; give at least one")
-    for given, known in ((tasks, TASKS), ([agent.partition(" --")[0] for agent in agents], AGENTS)):
+    for given, known in ((tasks, TASKS), ([agent.partition(" --")[0] for agent in agents.values()], AGENTS)):
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"there is no {unknown[0]}; there are {', '.join(known)}")
     return {
-        (task, agent, seed): plan(config, TASKS[task], agent, seed)
+        (task, name, seed): plan(config, TASKS[task], agent, seed)
         for task in tasks
         for seed in config.seeds
-        for agent in agents
+        for name, agent in agents.items()
     }
+
+
+def results_of(config: Config, plans: dict[tuple[str, str, int], Plan]) -> dict[str, dict[str, list[evaluate.RunLog]]]:
+    """Return the finished runs by task and agent: a list for each, empty where there is no result."""
+    tasks = defaultdict(lambda: defaultdict(list))
+    for (task, agent, _), each in plans.items():
+        run = result_of(config, each)
+        tasks[task][agent] += [] if run is None else [run]
+    return tasks
 
 
 def main(config: Config) -> None:
@@ -408,16 +450,18 @@ def main(config: Config) -> None:
     plans = plans_of(config)  # all at once: tyro, which parses their command lines, is not made for several threads
     if not config.report:
         train_missing(config, [*plans.values()])
-    runs = {key: run for key, each in plans.items() if (run := result_of(config, each)) is not None}
-    if not runs:
+    tasks = results_of(config, plans)
+    found = {name: agents for name, agents in tasks.items() if any(agents.values())}
+    if not found:
         raise SystemExit(f"{config.results} has no results of these agents; without --report they are trained")
-    tables = defaultdict(lambda: defaultdict(list))  # the runs by task and agent
-    for key in plans:
-        task, agent, _ = key
-        tables[task][agent] += [runs[key]] if key in runs else []
-    for task, of_agents in tables.items():
-        print_table(TASKS[task], of_agents)
-    evaluate.draw_curves(evaluate.Config(curves=tuple(run.path for run in runs.values()), out=str(config.out)))
+    if len(found) > 1:
+        print(f"{overview(found)}\n")
+    for name, agents in found.items():
+        print(f"## {TASKS[name].title}\n\n{table(TASKS[name], agents)}\n")
+    for name, agents in tasks.items():
+        if missing := [agent for agent, runs in agents.items() if not runs]:
+            print(f"{name}: no results of {'; '.join(missing)}")
+    evaluate.draw_tasks({TASKS[name].title: agents for name, agents in found.items()}, str(config.out))
 
 
 if __name__ == "__main__":

@@ -56,6 +56,6 @@ def test_the_memory_of_the_page(tmp_path):
     told = python("-m", "pytest", "-p", "no:cacheprovider", *tests)
     assert int(re.search(r"(\d+) passed", told).group(1)) >= 19
     few = ["--seeds", "1", "--steps-scale", "0.01", "--evaluations", "1"]
-    assert "| minGRU | 1 |" in python("benchmarks/learning.py", "--tasks", "mortar-mayhem", "--agents", "minGRU", *few)
+    assert "\n| minGRU | 0." in python("benchmarks/learning.py", "--tasks", "mortar-mayhem", "--agents", "minGRU", *few)
     (model,) = tmp_path.glob("learning/runs/*/model.pt")
     assert "| minGRU | 1 |" in python("evaluate.py", str(model), "--levels", "1", "--repeats", "1")

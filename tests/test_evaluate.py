@@ -261,17 +261,16 @@ def test_curves_drawn(agents, scalars, capsys):
 def test_a_curve_is_the_iqm_with_its_band(agents, scalars):
     runs = {"gru": [evaluate.read_run(folder) for folder in agents[:2]], "trxl": [evaluate.read_run(agents[2])]}
     axis = Figure().subplots()
-    evaluate.draw_metric(axis, "losses/entropy", runs)
+    evaluate.draw_metric(axis, "losses/entropy", runs, {"gru": {"color": "C0"}, "trxl": {"color": "C1"}})
     curves = np.stack([scalars(folder)["losses/entropy"] for folder in agents])
     gru, trxl = axis.lines
     assert np.allclose(gru.get_ydata(), curves[:2].mean(0))  # a quarter of two seeds is none
     assert np.allclose(trxl.get_ydata(), curves[2])
     assert gru.get_xdata().tolist() == [512, 1024]
-    assert gru.get_color() != trxl.get_color()
+    assert (gru.get_color(), trxl.get_color()) == ("C0", "C1")
     (band,) = axis.collections  # a single seed has none
     low, high = band.get_paths()[0].get_extents().intervaly
     assert (low, high) == pytest.approx((curves[:2].min(), curves[:2].max()))
-    assert axis.get_legend_handles_labels()[1] == ["gru, 2 seeds", "trxl, 1 seed"]
 
 
 def test_hyperparameters_are_those_of_the_run(agents):
@@ -402,7 +401,8 @@ def test_curves_over_time_are_aligned_in_hours():
     fast = evaluate.read_run(write_events("a", 1, [(1800, 1800)] * 3))  # 1, 2 and 3 hours
     slow = evaluate.read_run(write_events("b", 2, [(3600, 3600)] * 3))  # 2, 4 and 6 hours
     axis = Figure().subplots()
-    last = evaluate.draw_metric(axis, "charts/episodic_return", {"gru": [fast, slow]}, "time")
+    styles = {"gru": {"color": "C0"}}
+    last = evaluate.draw_metric(axis, "charts/episodic_return", {"gru": [fast, slow]}, styles, "time")
     (line,) = axis.lines
     assert line.get_xdata().tolist() == [2, 3], "as far as both reach"
     assert line.get_ydata().tolist() == [1.5, 2.25]
@@ -464,6 +464,26 @@ def test_three_tasks_are_drawn_two_by_two():
     assert 1.3 < width / height < 1.5  # four pictures of 5.5 by 4 inches
     titles = [element for element in Path("curves.svg").read_text().split("<!-- ") if element[1:6] == "-v0 -"]
     assert len(titles) == 3
+
+
+def test_an_agent_has_one_look_in_all_tasks_and_one_place_in_the_legend(monkeypatch):
+    figures = []
+    monkeypatch.setattr(evaluate.Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    run = evaluate.read_run(write_events("a", 1, [(1, 1), (1, 1)]))
+    others = {f"task {i}": {f"agent {i}": [run]} for i in range(9)}
+    tasks = {"first": {"lstm": [], "gru": [run, run]}, "second": {"trxl": [run], "gru": [run]}} | others
+    last = evaluate.draw_tasks(tasks, "curves")
+    assert [*last["first"]] == ["gru"], "nothing to draw of the LSTM"
+    figure = figures[0]
+    first, second, *_, ninth = figure.axes
+    assert first.lines[0].get_color() == second.lines[1].get_color() != second.lines[0].get_color()
+    looks = {(line.get_color(), line.get_linestyle()) for axis in figure.axes for line in axis.lines}
+    assert len(looks) == 11, "gru, trxl and nine others; there are ten colours"
+    (legend,) = figure.legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert texts[:3] == ["gru, 1 to 2 seeds", "trxl, 1 seed", "agent 0, 1 seed"]
+    in_legend = dict(zip(texts, legend.get_lines(), strict=True))["agent 8, 1 seed"]
+    assert in_legend.get_color() == ninth.lines[0].get_color()
 
 
 # ---- scores ----

@@ -97,14 +97,15 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     learning.main(config)  # its result is enough
     told = capsys.readouterr().out
     assert "trained" not in told
-    assert f"| {agent} | 1 |" in told
-    assert f"\nMachines: {kept.machine}\n" in told
+    score = kept.curves["eval/commands_completed"][1][-1].mean()
+    assert f"\n| {agent} | {score:.2f} | {score:.2f} |" in told
+    assert f"\nRuns: 1, 0.0 hours without evaluations. Machines: {kept.machine}\n" in told
     assert config.out.with_suffix(".png").stat().st_size > 10_000
 
     config = replace(config, report=True, agents=(agent, "LSTM"), seeds=(1, 2))
     learning.main(config)
     told = capsys.readouterr().out
-    assert ("trained" not in told, "no results of LSTM\n" in told, f"| {agent} | 1 |" in told) == (True, True, True)
+    assert ("trained" not in told, "no results of LSTM\n" in told, f"| {agent} | {score:.2f} |" in told) == (True,) * 3
     assert not config.folder.exists() or not [*config.folder.iterdir()]
     with pytest.raises(SystemExit, match="nowhere has no results of these agents; without --report they are trained"):
         learning.main(replace(config, results=tmp_path / "nowhere"))
@@ -139,16 +140,47 @@ def test_runs_share_the_cores_unless_told_how_many_threads_to_have(tmp_path, mon
     assert log.read_text() == "3\n7\n3\n"
 
 
-def test_a_row_of_the_table():
-    def run(*means):
-        steps = np.array([100, 200, 300])
-        scores = np.broadcast_to(np.reshape(means, (3, 1, 1)), (3, 4, 2))
-        seconds = np.full((3, 1, 1), 60.0)
-        return evaluate.RunLog("", {}, {"eval/coins": (steps, scores), "charts/seconds_iteration": (steps, seconds)})
+def run_with(*means, metric="eval/coins"):
+    """Return a run that has these scores on all four levels, twice each, after 100, 200 and 300 steps."""
+    steps = np.array([100, 200, 300])
+    scores = np.broadcast_to(np.reshape(means, (3, 1, 1)), (3, 4, 2))
+    curves = {metric: (steps, scores), "charts/seconds_iteration": (steps, np.full((3, 1, 1), 60.0))}
+    return evaluate.RunLog("", {"total_timesteps": "300"}, curves, "a laptop")
 
-    row = learning.row("GRU", [run(2, 9, 10), run(7, 3, 8)], "coins", best=6.0)
-    assert row == "| GRU | 2 | 9.00 | 9.00 | 8.00 to 10.00 | 4.00 | 200 | 2.0 | 3.0 |", "the second fell from 7 to 3"
-    assert " | never |  | 3.0 |" in learning.row("GRU", [run(2, 9, 10), run(7, 3, 8)], "coins", best=12.0)
+
+def test_a_row_of_the_table():
+    row = learning.row("GRU", [run_with(2, 9, 10), run_with(7, 3, 8)], "coins", best=6.0)
+    assert row == "| GRU | 10.00, 8.00 | 9.00 | 9.00 | 8.00 to 10.00 | 4.00 | 200 | 2.0 | 3.0 |", "one fell from 7 to 3"
+    assert " | never |  | 3.0 |" in learning.row("GRU", [run_with(2, 9, 10), run_with(7, 3, 8)], "coins", best=12.0)
+    assert "| 8.00 | 8.00 | one seed |" in learning.row("GRU", [run_with(7, 3, 8)], "coins", best=12.0)
+
+
+def test_a_table_leaves_out_agents_without_runs_and_compares_with_the_best():
+    metric = learning.TASKS["SearingSpotlights-v0"].metric
+    ours, theirs = (run_with(0, 0.5, last, metric=f"eval/{metric}") for last in (0.5, 1))
+    table = learning.table(
+        learning.TASKS["SearingSpotlights-v0"], {"GRU": [ours], "LSTM": [], "TrXL": [theirs, theirs]}
+    )
+    head, *rows, note = [line for line in table.splitlines() if line]
+    assert head == "success after 300 steps"
+    assert [row.split(" | ")[0] for row in rows[2:]] == ["| GRU", "| TrXL"]
+    assert ["never" in row for row in rows[2:]] == [True, False]
+    assert note == "Runs: 3, 0.1 hours without evaluations. Machines: a laptop"
+
+
+def test_an_overview_says_where_seeds_or_agents_are_missing():
+    spotlights = run_with(0, 0, 0.25, metric="eval/success")
+    commands = run_with(0, 0, 2, metric="eval/commands_completed")
+    tasks = {
+        "SearingSpotlights-v0": {"GRU": [spotlights] * 3, "LSTM": [spotlights]},
+        "Endless-MortarMayhem-v0": {"GRU": [commands] * 2, "LSTM": []},
+    }
+    assert learning.overview(tasks).splitlines() == [
+        "| task, metric | GRU | LSTM |",
+        "|---|---:|---:|",
+        "| SearingSpotlights-v0, success | 0.25 (0.25) | 0.25 (0.25), 1 seed |",
+        "| Endless-MortarMayhem-v0, commands_completed | 2.00 (2.00), 2 seeds |  |",
+    ]
 
 
 @pytest.mark.slow
@@ -173,4 +205,4 @@ def test_the_full_suite():
     tasks, agents = learning.SUITES["full"]
     assert len(tasks) == 10
     assert [(name, task.env_id, task.options) for name, task in tasks.items()] == [(i, i, {}) for i in tasks]
-    assert len(agents) == len(set(agents)) == 9
+    assert len(agents) == len(set(agents.values())) == 9
