@@ -444,7 +444,9 @@ def add_legend(figure: Figure, tasks: dict[str, dict[str, list[RunLog]]], styles
         if counts:
             span = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
             lines.append(Line2D([], [], **styles[label]))
-            texts.append(f"{textwrap.fill(label, LABEL_WIDTH)}, {span} seed{'s' * (counts[-1] > 1)}")
+            texts.append(
+                f"{textwrap.fill(label, LABEL_WIDTH, break_on_hyphens=False)}, {span} seed{'s' * (counts[-1] > 1)}"
+            )
     widest = 0.8 + 0.085 * max(len(line) for text in texts for line in text.splitlines())  # inches
     columns = max(1, int(figure.get_figwidth() / widest))
     figure.set_figheight(figure.get_figheight() + 0.22 * sum(text.count("\n") + 1 for text in texts) / columns)

@@ -200,7 +200,8 @@ def test_command(page, command):
     assert wrong is None, f"{page}: {command}\n{wrong}"
 
 
-DRAWN = sorted({call for _, call in COMMANDS.values() if "learning.py" in call and "--results benchmarks/res" in call})
+LEARNING = sorted({call for _, call in COMMANDS.values() if "benchmarks/learning.py" in call})
+DRAWN = [call for call in LEARNING if "--results benchmarks/results" in call and "--report" not in call]
 
 
 @pytest.mark.parametrize("command", DRAWN, ids=range(len(DRAWN)))

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ import torch
 import evaluate
 import learning
 import ppo_gru
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize("task", learning.TASKS)
@@ -181,6 +184,16 @@ def test_an_overview_says_where_seeds_or_agents_are_missing():
         "| SearingSpotlights-v0, success | 0.25 (0.25) | 0.25 (0.25), 1 seed |",
         "| Endless-MortarMayhem-v0, commands_completed | 2.00 (2.00), 2 seeds |  |",
     ]
+
+
+def test_the_page_of_the_ten_tasks_has_the_tables_of_the_results_that_are_there():
+    config = learning.Config(suite="full", results=ROOT / "benchmarks/results")
+    tasks = learning.results_of(config, learning.plans_of(config))
+    page = (ROOT / "docs/benchmark.md").read_text()
+    assert learning.overview(tasks) in page
+    for name, agents in tasks.items():
+        assert f"## {name}\n" in page
+        assert learning.table(learning.TASKS[name], agents) in page, name
 
 
 @pytest.mark.slow
