@@ -80,6 +80,7 @@ BOOKKEEPING |= {
 }
 RESAMPLES = 2000
 LABEL_WIDTH = 48  # characters of a line in a legend; a longer one would leave no room for the curves
+COLORS = [color for color in color_sequences["petroff10"] if color not in ("#94a4a2", "#717581")]  # without its greys
 POINTS = 200  # of a curve; one that has more is averaged over neighbours
 # Scalars of every iteration, in seconds: the first is the sum of the others. Evaluations are in none of them.
 SECONDS = {name: f"charts/seconds_{name}" for name in ("iteration", "collect", "update")}
@@ -270,6 +271,9 @@ class RunLog:
         return set(SECONDS.values()) <= set(self.curves)
 
 
+Runs = dict[str, list[RunLog]]  # the seeds of each agent, by its label
+
+
 def read_run(path: str) -> RunLog:
     """Read a run folder's TensorBoard files, or a file of `write_run`; raise NoCurvesError if it holds none."""
     if path.endswith(".json.gz"):
@@ -403,7 +407,7 @@ def align(runs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.nda
 
 
 def draw_metric(
-    axis: Axes, name: str, agents: dict[str, list[RunLog]], styles: dict[str, dict], over: str = "steps"
+    axis: Axes, name: str, agents: Runs, styles: dict[str, dict], over: str = "steps"
 ) -> dict[str, np.ndarray]:
     """Draw a curve of every agent, its runs by label, over steps or time; return each one's last scores (R, M, E)."""
     last = {}
@@ -426,7 +430,10 @@ def draw_metric(
 
 
 def blank_pictures(tasks: int, metrics: int) -> tuple[Figure, np.ndarray]:
-    """Return a figure and its axes (tasks, metrics): tasks side by side, or with several metrics below each other."""
+    """Return a figure and its axes (tasks, metrics).
+
+    With one metric, up to three tasks are side by side; with several, each task has a row.
+    """
     across = min(tasks, 2 if tasks <= 4 else 3) if metrics == 1 else 1
     down = math.ceil(tasks / across)
     figure = Figure(figsize=(5.5 * across * metrics, 3.8 * down), layout="constrained")
@@ -436,17 +443,16 @@ def blank_pictures(tasks: int, metrics: int) -> tuple[Figure, np.ndarray]:
     return figure, grid[:tasks]
 
 
-def add_legend(figure: Figure, tasks: dict[str, dict[str, list[RunLog]]], styles: dict[str, dict]) -> None:
+def add_legend(figure: Figure, tasks: dict[str, Runs], styles: dict[str, dict]) -> None:
     """Add one legend for all tasks below their pictures, with the number of each agent's seeds."""
     lines, texts = [], []
     for label in styles:
-        counts = sorted(len(agents[label]) for agents in tasks.values() if label in agents)
+        counts = [len(agents[label]) for agents in tasks.values() if label in agents]
         if counts:
-            span = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
+            least, most = min(counts), max(counts)
+            seeds = f"{most} seed{'s' * (most > 1)}" if least == most else f"{least} to {most} seeds"
             lines.append(Line2D([], [], **styles[label]))
-            texts.append(
-                f"{textwrap.fill(label, LABEL_WIDTH, break_on_hyphens=False)}, {span} seed{'s' * (counts[-1] > 1)}"
-            )
+            texts.append(textwrap.fill(f"{label}, {seeds}", LABEL_WIDTH, break_on_hyphens=False))
     widest = 0.8 + 0.085 * max(len(line) for text in texts for line in text.splitlines())  # inches
     columns = max(1, int(figure.get_figwidth() / widest))
     figure.set_figheight(figure.get_figheight() + 0.22 * sum(text.count("\n") + 1 for text in texts) / columns)
@@ -454,14 +460,14 @@ def add_legend(figure: Figure, tasks: dict[str, dict[str, list[RunLog]]], styles
 
 
 def draw_tasks(
-    tasks: dict[str, dict[str, list[RunLog]]], out: str, metrics: tuple[str, ...] = (), over: str = "steps"
+    tasks: dict[str, Runs], out: str, metrics: tuple[str, ...] = (), over: str = "steps"
 ) -> dict[str, dict[str, dict[str, np.ndarray]]]:
     """Draw each task and metric to OUT.png and OUT.svg; tasks: the runs, if any, by the task's title and agent's label.
 
     Without metrics, the family's own. Return the last scores (R, M, E) by title, label and name of the curve.
     """
     labels = dict.fromkeys(itertools.chain(*tasks.values()))  # also of agents without runs: others keep their colours
-    looks = itertools.cycle(itertools.product(("-", "--", ":"), color_sequences["petroff10"]))
+    looks = itertools.cycle(itertools.product(("-", "--", ":"), COLORS))
     styles = {label: {"linestyle": line, "color": color} for label, (line, color) in zip(labels, looks, strict=False)}
     tasks = {title: {label: runs for label, runs in agents.items() if runs} for title, agents in tasks.items()}
     figure, grid = blank_pictures(len(tasks), len(metrics) or 1)

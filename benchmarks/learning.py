@@ -25,7 +25,6 @@ import signal
 import subprocess
 import sys
 import zlib
-from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
@@ -360,8 +359,10 @@ def row(agent: str, runs: list[evaluate.RunLog], metric: str, best: float) -> st
     means = scores.mean((-2, -1))  # (P, R)
     drop = (np.maximum.accumulate(means) - means).max()
     middle = evaluate.iqm(scores)  # (P,)
-    near = np.flatnonzero(middle >= 0.9 * best) if best > 0 else np.array([])
+    near = np.flatnonzero(middle >= 0.9 * best)
     taken = (f"{steps[near[0]]:,.0f}", f"{minutes[near[0]]:.1f}") if near.size else ("never", "")
+    if best == 0:
+        taken = ("the best is 0", "")
     span = "one seed" if ends is None else "{:.2f} to {:.2f}".format(*ends)
     each_seed = ", ".join(f"{mean:.2f}" for mean in means[-1])
     reached = f"{each_seed} | {scores[-1].mean():.2f} | {middle[-1]:.2f} | {span} | {drop:.2f}"
@@ -373,25 +374,27 @@ def last_scores(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
     return evaluate.align([run.curves[f"eval/{task.metric}"] for run in runs])[1][-1]
 
 
-def table(task: Task, agents: dict[str, list[evaluate.RunLog]]) -> str:
+def table(task: Task, agents: evaluate.Runs) -> str:
     """Return a task's table, a row for each agent that has runs, and below it what these took and on which machines."""
     runs_of = {agent: runs for agent, runs in agents.items() if runs}
     best = max(float(evaluate.iqm(last_scores(task, runs))) for runs in runs_of.values())
     every_run = [run for runs in runs_of.values() for run in runs]
     hours = sum(run.seconds("iteration").sum() for run in every_run) / 3600
     machines = "; ".join(dict.fromkeys(run.machine for run in every_run))
-    reached = ("agent", "each seed", "mean", "IQM", "95 % interval", "largest drop")
+    header = (
+        "agent | each seed | mean | IQM | 95 % interval | largest drop | steps to 0.9 of the best | minutes to there"
+    )
     lines = [
         f"{task.metric} after {int(every_run[0].args['total_timesteps']):,} steps\n",
-        f"| {' | '.join(reached)} | steps to 0.9 of the best | minutes | in all |",
+        f"| {header} | minutes |",
         "|---|---|---:|---:|---|---:|---:|---:|---:|",
         *(row(agent, runs, task.metric, best) for agent, runs in runs_of.items()),
-        f"\nRuns: {len(every_run)}, {hours:.1f} hours without evaluations. Machines: {machines}",
+        f"\nRuns: {len(every_run)}, together {hours:.1f} hours without evaluations. Machines: {machines}",
     ]
     return "\n".join(lines)
 
 
-def overview(tasks: dict[str, dict[str, list[evaluate.RunLog]]]) -> str:
+def overview(tasks: dict[str, evaluate.Runs]) -> str:
     """Return a table with a row for each task: the IQM of each agent at the end of training, and its mean in brackets.
 
     Where an agent has fewer seeds than others, it says how many; where it has none, there is no number.
@@ -407,9 +410,9 @@ def overview(tasks: dict[str, dict[str, list[evaluate.RunLog]]]) -> str:
         return f"{evaluate.iqm(scores):.2f} ({scores.mean():.2f}){few}"
 
     lines = [f"| task, metric | {' | '.join(names)} |", f"|---|{'---:|' * len(names)}"]
-    for name, agents in tasks.items():
-        cells = [cell(TASKS[name], runs) for runs in agents.values()]
-        lines.append(f"| {name}, {TASKS[name].metric} | {' | '.join(cells)} |")
+    for task, agents in tasks.items():
+        cells = [cell(TASKS[task], agents.get(name, [])) for name in names]
+        lines.append(f"| {task}, {TASKS[task].metric} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -419,7 +422,8 @@ def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
     Raises SystemExit for names that this program does not know, no seed, and what cannot be planned.
     """
     suite_tasks, suite_agents = SUITES[config.suite]
-    tasks, agents = config.tasks or suite_tasks, {agent: agent for agent in config.agents} or suite_agents
+    tasks = config.tasks or suite_tasks
+    agents = {name: suite_agents.get(name, name) for name in config.agents} or suite_agents
     if not config.seeds:
         raise SystemExit("--seeds is empty; give at least one")
     for given, known in ((tasks, TASKS), ([agent.partition(" --")[0] for agent in agents.values()], AGENTS)):
@@ -433,12 +437,13 @@ def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
     }
 
 
-def results_of(config: Config, plans: dict[tuple[str, str, int], Plan]) -> dict[str, dict[str, list[evaluate.RunLog]]]:
+def results_of(config: Config, plans: dict[tuple[str, str, int], Plan]) -> dict[str, evaluate.Runs]:
     """Return the finished runs by task and agent: a list for each, empty where there is no result."""
-    tasks = defaultdict(lambda: defaultdict(list))
+    tasks = {task: {} for task, _, _ in plans}
     for (task, agent, _), each in plans.items():
-        run = result_of(config, each)
-        tasks[task][agent] += [] if run is None else [run]
+        runs = tasks[task].setdefault(agent, [])
+        if (run := result_of(config, each)) is not None:
+            runs.append(run)
     return tasks
 
 
