@@ -80,7 +80,6 @@ BOOKKEEPING |= {
 }
 RESAMPLES = 2000
 LABEL_WIDTH = 48  # characters of a line in a legend; a longer one would leave no room for the curves
-COLORS = [color for color in color_sequences["petroff10"] if color not in ("#94a4a2", "#717581")]  # without its greys
 POINTS = 200  # of a curve; one that has more is averaged over neighbours
 # Scalars of every iteration, in seconds: the first is the sum of the others. Evaluations are in none of them.
 SECONDS = {name: f"charts/seconds_{name}" for name in ("iteration", "collect", "update")}
@@ -467,7 +466,7 @@ def draw_tasks(
     Without metrics, the family's own. Return the last scores (R, M, E) by title, label and name of the curve.
     """
     labels = dict.fromkeys(itertools.chain(*tasks.values()))  # also of agents without runs: others keep their colours
-    looks = itertools.cycle(itertools.product(("-", "--", ":"), COLORS))
+    looks = itertools.cycle(itertools.product(("-", "--", ":"), color_sequences["tab10"]))
     styles = {label: {"linestyle": line, "color": color} for label, (line, color) in zip(labels, looks, strict=False)}
     tasks = {title: {label: runs for label, runs in agents.items() if runs} for title, agents in tasks.items()}
     figure, grid = blank_pictures(len(tasks), len(metrics) or 1)

@@ -478,7 +478,7 @@ def test_an_agent_has_one_look_in_all_tasks_and_one_place_in_the_legend(monkeypa
     first, second, *_, ninth = figure.axes
     assert first.lines[0].get_color() == second.lines[1].get_color() != second.lines[0].get_color()
     looks = {(line.get_color(), line.get_linestyle()) for axis in figure.axes for line in axis.lines}
-    assert len(looks) == 11, "gru, trxl and nine others; there are fewer colours"
+    assert len(looks) == 11, "gru, trxl and nine others; there are ten colours"
     (legend,) = figure.legends
     texts = [text.get_text() for text in legend.get_texts()]
     assert texts[:3] == ["gru, 1 to 2 seeds", "trxl, 1 seed", "agent 0, 1 seed"]
