@@ -25,7 +25,7 @@ import signal
 import subprocess
 import sys
 import zlib
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -262,6 +262,20 @@ def is_complete(run: evaluate.RunLog) -> bool:
 RUNNING = set()  # training processes, to be stopped with this one
 
 
+def log_of(config: Training, plan: Plan) -> Path:
+    """Return the file that a training's output goes to: another one where only the task's options differ."""
+    task_hash = zlib.crc32(json.dumps(asdict(plan.task)).encode())
+    return config.folder / f"{plan.task.env_id}-{file_name(plan.agent)}-{plan.seed}-{task_hash:08x}.log"
+
+
+def steps_so_far(config: Training, plan: Plan) -> int:
+    """Return how many steps a training has done, by the script's progress bar at the end of its log."""
+    log = log_of(config, plan)
+    bars = re.findall(r"([\d.]+)([kM]?)/[\d.]+[kM]? \[", log.read_text()[-1000:] if log.exists() else "")
+    number, unit = bars[-1] if bars else ("0", "")
+    return int(float(number) * {"": 1, "k": 1e3, "M": 1e6}[unit])
+
+
 def train(config: Training, plan: Plan) -> None:
     """Run a training, or go on with one that was stopped; raise SystemExit that names its log if it fails."""
     line = plan.command
@@ -269,8 +283,7 @@ def train(config: Training, plan: Plan) -> None:
         if glob.glob(f"{run.path}/checkpoint-*.pt"):
             line = [*line[:2], "--resume", os.path.relpath(run.path, config.folder)]
     threads = str(max(1, (os.cpu_count() or 1) // config.jobs))
-    task_hash = zlib.crc32(json.dumps(asdict(plan.task)).encode())
-    log = config.folder / f"{plan.task.env_id}-{file_name(plan.agent)}-{plan.seed}-{task_hash:08x}.log"
+    log = log_of(config, plan)
     environment = {"OMP_NUM_THREADS": threads, **os.environ, "TQDM_MININTERVAL": "10"}
     with log.open("a") as output:
         # In a session of its own, Ctrl-C does not reach it: `train_missing` stops it, so that it leaves a checkpoint.
@@ -315,7 +328,7 @@ def machine() -> str:
 
 
 def train_missing(config: Training, wanted: list[Plan]) -> None:
-    """Do the trainings that have no result, some at a time, and show how long it takes.
+    """Do the trainings that have no result, some at a time, and show how far they are and how long it takes.
 
     Raises SystemExit, at the end, if some failed.
     """
@@ -324,21 +337,26 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
     each_once = {plan.command: plan for plan in wanted}.values()
     missing = [plan for plan in each_once if result_of(config, plan) is None]
     steps = sum(plan.args.total_timesteps for plan in missing)
+    before = sum(steps_so_far(config, plan) for plan in missing)  # of trainings that were stopped
     failed = []
     with (
         ThreadPoolExecutor(config.jobs) as pool,
-        # The bar moves when a run ends: only the mean speed so far tells how long the rest takes.
-        tqdm(total=steps, unit=" steps", unit_scale=True, smoothing=0, disable=not missing) as bar,
+        tqdm(total=steps, initial=before, unit=" steps", unit_scale=True, smoothing=0, disable=not missing) as bar,
     ):
         trainings = {pool.submit(write_result, config, plan): plan for plan in missing}
+        unfinished = set(trainings)
         try:
-            for training in as_completed(trainings):
-                try:
-                    training.result()
-                except SystemExit as error:
-                    failed.append(str(error))
-                    tqdm.write(failed[-1])
-                bar.update(trainings[training].args.total_timesteps)
+            while unfinished:
+                ended, unfinished = wait(unfinished, timeout=10, return_when=FIRST_COMPLETED)
+                for training in ended:
+                    try:
+                        training.result()
+                    except SystemExit as error:
+                        failed.append(str(error))
+                        tqdm.write(failed[-1])
+                left = [trainings[each] for each in unfinished]
+                bar.n = steps - sum(plan.args.total_timesteps - steps_so_far(config, plan) for plan in left)
+                bar.refresh()
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in RUNNING.copy():

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tqdm import tqdm
 
 import evaluate
 import learning
@@ -149,6 +150,20 @@ def run_with(*means, metric="eval/coins"):
     scores = np.broadcast_to(np.reshape(means, (3, 1, 1)), (3, 4, 2))
     curves = {metric: (steps, scores), "charts/seconds_iteration": (steps, np.full((3, 1, 1), 60.0))}
     return evaluate.RunLog("", {"total_timesteps": "300"}, curves, "a laptop")
+
+
+def test_a_log_tells_how_far_its_training_is(tmp_path):
+    config = learning.Config(folder=tmp_path)
+    plan, other = (learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", seed) for seed in (1, 2))
+    with learning.log_of(config, plan).open("w") as log:
+        bar = tqdm(total=1_000_000, unit=" steps", unit_scale=True, file=log, mininterval=0)  # as the scripts have it
+        for steps, seen in ((500, 500), (299_500, 300_000), (700_000, 1_000_000)):
+            bar.update(steps)
+            bar.set_postfix({"SPS": 12_345})
+            log.flush()
+            assert learning.steps_so_far(config, plan) == seen
+        bar.close()
+    assert learning.steps_so_far(config, other) == 0, "another seed has not begun"
 
 
 def test_a_row_of_the_table():
