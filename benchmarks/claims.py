@@ -182,7 +182,7 @@ CLAIMS = {
     ),
     "endless-mystery-path": Claim(
         "6.3", "GRU has a higher return than TrXL in Endless Mystery Path", ENDLESS_MYSTERY_PATH,
-        ("GRU",), (WIDE_QUERY_POSITION,),
+        ("GRU",), (WIDE_TRXL, WIDE_QUERY_POSITION),
     ),
     "endless-spotlights": Claim(
         "6.3", "GRU collects more coins than TrXL in Endless Searing Spotlights", ENDLESS_SPOTLIGHTS,
