@@ -182,11 +182,11 @@ CLAIMS = {
     ),
     "endless-mystery-path": Claim(
         "6.3", "GRU has a higher return than TrXL in Endless Mystery Path", ENDLESS_MYSTERY_PATH,
-        ("GRU",), (WIDE_TRXL, WIDE_QUERY_POSITION),
+        ("GRU",), (WIDE_TRXL,),
     ),
     "endless-spotlights": Claim(
         "6.3", "GRU collects more coins than TrXL in Endless Searing Spotlights", ENDLESS_SPOTLIGHTS,
-        ("GRU",), (WIDE_QUERY_POSITION,),
+        ("GRU",), (WIDE_TRXL,),
     ),
     "falls": Claim(
         "6.5.2", "TrXL falls off less often than GRU in Mystery Path", MYSTERY_PATH, ("GRU",), ("TrXL",), falls
