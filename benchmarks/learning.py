@@ -348,7 +348,7 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
         try:
             while unfinished:
                 ended, unfinished = wait(unfinished, timeout=10, return_when=FIRST_COMPLETED)
-                for training in ended:
+                for training in [each for each in trainings if each in ended]:  # in the order of the plans
                     try:
                         training.result()
                     except SystemExit as error:
