@@ -72,7 +72,7 @@ BOOKKEEPING |= {
     "eval_levels",
     "eval_repeats",
     "eval_max_steps",
-    "compile",
+    "compile",  # of runs before it was removed
     "preset",
     "resume",
     "checkpoint_interval",
@@ -636,7 +636,10 @@ def choose_metrics(wanted: tuple[str, ...], env_id: str, played: list[dict[str, 
 
 
 def score_checkpoints(config: Config) -> list[dict[str, Any]]:
-    """Play the levels with every checkpoint's agent; print a table for each task, and return what is in it."""
+    """Play the levels with every checkpoint's agent; print a table for each task, and return what is in it.
+
+    A task that does not tell the wanted metrics gets a line instead. Raises ValueError if none does.
+    """
     checkpoints = {path: Checkpoint.read(path, config) for path in dict.fromkeys(config.checkpoints)}
     arguments = {path: checkpoint.arguments() for path, checkpoint in checkpoints.items()}
     tasks = tasks_of(arguments, title_of)
@@ -644,7 +647,13 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
     report = []
     for title, agents in tasks.items():
         paths = list(itertools.chain(*agents.values()))
-        metrics = choose_metrics(config.metrics, arguments[paths[0]]["env_id"], [played[path] for path in paths])
+        try:
+            metrics = choose_metrics(config.metrics, arguments[paths[0]]["env_id"], [played[path] for path in paths])
+        except ValueError as error:
+            if len(tasks) == 1:
+                raise
+            print(f"{title}: {error}", file=sys.stderr)
+            continue
         summaries = []
         for label, members in agents.items():
             scores = {name: np.stack([played[path][name] for path in members]) for name in metrics}  # (R, M, E) each
@@ -654,6 +663,8 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
         print(f"{title}\n\n{table(summaries)}\n")
         if finished < 1:
             print(f"--max-steps cut {1 - finished:.2%} of the episodes; what only their end tells is left out\n")
+    if not report:
+        raise ValueError(f"no task tells {', '.join(config.metrics)}")
     return report
 
 
@@ -665,8 +676,8 @@ def main(config: Config) -> None:
     if bool(config.checkpoints) == bool(config.curves):
         raise ValueError("give either checkpoints to play with (runs/*/model.pt), or --curves and run folders (runs/*)")
     for name, low in (("levels", 1), ("repeats", 1), ("max_steps", 1), ("seed", 0)):
-        if getattr(config, name) < low:
-            raise ValueError(f"{ppo_gru.flag(name)} is {getattr(config, name)}; it must be {low} or more")
+        if not low <= getattr(config, name) < 2**63:
+            raise ValueError(f"{ppo_gru.flag(name)} is {getattr(config, name)}; it must be from {low} to 2 ** 63 - 1")
     for path in (config.json, config.out):
         if path is not None and not os.path.isdir(os.path.dirname(path) or "."):
             raise ValueError(f"there is no folder {os.path.dirname(path)} to write to")
@@ -682,3 +693,5 @@ if __name__ == "__main__":
         main(config)
     except (ValueError, OSError, ImportError, gym.error.Error) as error:
         sys.exit(f"evaluate.py: {' '.join(str(error).split())}")
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -42,7 +42,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TextIO, get_args, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, TextIO, get_args, get_origin, get_type_hints
 
 import gymnasium as gym
 import numpy as np
@@ -111,8 +111,6 @@ class Args:
     """train on the GPU when there is one"""
     amp: bool = False
     """compute the networks in bfloat16, faster on processors that have it; losses stay in float32"""
-    compile: bool = False
-    """compile the convolutions and the heads before training: takes a minute, and on a CPU a C++ compiler"""
     track: bool = False
     """log to Weights and Biases too (needs the extra `track`)"""
     wandb_project_name: str = "memory-gym-baselines"
@@ -367,7 +365,8 @@ def log_barrier(policy: list[Categorical]) -> Tensor:
     """Return the mean log-probability of all actions, not only of those taken: over samples, summed over branches.
 
     It is largest for a uniform policy. Where an action's probability is near 0, the gradients of the surrogate loss and
-    of the entropy are near 0 too; that of the log barrier is not (Agarwal et al., 2021).
+    of the entropy are near 0 too; that of the log barrier is not (Agarwal et al., On the Theory of Policy Gradient
+    Methods, 2021).
     """
     return sum(branch.logits.mean() for branch in policy)  # a Categorical's logits are normalized
 
@@ -614,7 +613,8 @@ class Decoder(nn.Sequential):
 def visible(age: Tensor, episode_step: Tensor, window: int) -> Tensor:
     """Return whether a query at this step of its episode sees the item that was stored `age` steps before it.
 
-    The rollout, the bootstrap value and the update all ask this function; nothing else decides what is seen.
+    The rollout, the bootstrap value and the update all ask this function. How far back they ask, `Memory.reach` says:
+    at least as far as something may be visible.
     """
     return (age >= 1) & (age <= episode_step) & (age <= window)
 
@@ -735,7 +735,8 @@ def block_init(block: Block, scheme: str, blocks: int) -> None:
     init = {"orthogonal": nn.init.orthogonal_, "kaiming": nn.init.kaiming_normal_}.get(scheme, nn.init.xavier_uniform_)
     for layer in block.modules():
         if isinstance(layer, nn.Linear):
-            init(layer.weight)
+            for matrix in layer.weight.detach().split(layer.in_features):  # a gate's layer holds several, square as all
+                init(matrix)
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)
     if scheme == "tfixup":
@@ -1314,7 +1315,8 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
             found["return"] += rewards * playing
             found["length"] += playing
             for name, which, values in final_numbers(infos, done & playing):
-                found.setdefault(name, np.full(len(levels), np.nan))[which] = values
+                if name not in ("return", "length"):  # which are the sums above, whatever the environment calls so
+                    found.setdefault(name, np.full(len(levels), np.nan))[which] = values
             playing &= ~done
             if not playing.any():
                 break
@@ -1405,6 +1407,8 @@ def check_args(args: Args) -> None:
         for bounds in (each for part in parts for each in getattr(part, "__metadata__", ())):
             if isinstance(bounds, Bounds) and value is not None and not bounds.allow(value):
                 raise ValueError(f"{flag(name)} is {value}; it must be {bounds.text}")
+        if get_origin(kind) is Literal and value not in get_args(kind):  # in Python; tyro checks the command line
+            raise ValueError(f"{flag(name)} is {value!r}; it must be one of {', '.join(get_args(kind))}")
         if isinstance(value, int) and value >= 2**63:  # torch and NumPy take no more
             raise ValueError(f"{flag(name)} is {value}; it must be below 2 ** 63")
     if not args.exp_name or set(args.exp_name) & set("/\\"):
@@ -1462,7 +1466,7 @@ def setup(args: Args) -> Run:
     run = make_run(args, 0 if checkpoint is None else checkpoint["step"])
     if args.load_model is not None and checkpoint is None:
         load_weights(run.agent, read_model(args.load_model), args.load_model)
-    speed_up(run.agent, args, run.rollout.next_obs)
+    speed_up(run.agent, args)
     rank, _ = rank_and_size()
     if rank == 0:
         make_folder(args, run)
@@ -1479,6 +1483,8 @@ def make_run(args: Args, step: int) -> Run:
     Of several processes, each has its share of the environments, and the first one evaluates.
     """
     rank, processes = rank_and_size()
+    random.seed(args.seed)  # it and NumPy's: environments of other packages may use them
+    np.random.seed(args.seed % 2**32)  # noqa: NPY002
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
     device = torch.device("cpu")
@@ -1501,8 +1507,11 @@ def make_run(args: Args, step: int) -> Run:
         )
         evaluates = args.eval_interval and rank == 0
         eval_envs = environments(args, len(evaluation_levels(args))) if evaluates else None
-    if rank > 0:  # all processes begin with the same weights, but sample actions of their own
-        torch.manual_seed(int(np.random.SeedSequence([args.seed, rank]).generate_state(1)[0]))
+    if rank > 0:  # all processes begin with the same weights, but draw numbers of their own
+        own = int(np.random.SeedSequence([args.seed, rank]).generate_state(1)[0])
+        random.seed(own)
+        np.random.seed(own)  # noqa: NPY002
+        torch.manual_seed(own)
     # The learning rate is a tensor, thus of float32. A float, which is of float64, would be simpler, but would change
     # rounding, and with it the curves of docs/results.md. The weight decay is torch's default.
     optimizer = torch.optim.AdamW(agent.parameters(), lr=torch.tensor(args.init_lr), weight_decay=0.01, fused=True)
@@ -1518,7 +1527,8 @@ def enough_memory(args: Args, device: torch.device) -> Iterator[None]:
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and "allocate" not in str(error):
             raise
-        harmless = ("seed", "total_timesteps", "start_level", "anneal_steps")
+        harmless = ("seed", "total_timesteps", "start_level", "num_levels", "anneal_steps", "num_minibatches")
+        harmless += ("update_epochs", "checkpoint_interval", "keep_models", "eval_interval", "eval_max_steps")
         sizes = [each for each in fields(Args) if type(each.default) is int and each.name not in harmless]
         large = [each.name for each in sizes if getattr(args, each.name) > each.default] or ["num_envs", "num_steps"]
         large = " ".join(f"{flag(name)} {getattr(args, name)}" for name in large)
@@ -1540,19 +1550,29 @@ def make_folder(args: Args, run: Run) -> None:
     """
     if args.resume is not None and not os.access(run.folder, os.W_OK):
         raise OSError(f"--resume {run.folder}: this folder cannot be written")
-    if args.track:
-        start_tracking(args, run.folder.resolve().name)
     try:
         run.folder.mkdir(parents=True, exist_ok=args.resume is not None)
+    except FileExistsError:  # another run has made it since it was named
+        run.folder = new_folder(args)
+        return make_folder(args, run)
     except OSError as error:
         where = "run where the folder runs can be written"
         raise OSError(f"cannot make {run.folder} ({error.strerror}); {where}") from None
+    if args.track:
+        try:
+            start_tracking(args, run.folder.resolve().name)
+        except (ValueError, ImportError):
+            if args.resume is None:
+                os.removedirs(run.folder)
+            raise
     run.lock = open(run.folder / ".lock", "w")  # noqa: SIM115 (until the run is closed)
     if fcntl is not None:
         try:
             fcntl.flock(run.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             raise OSError(f"--resume {run.folder}: another process is training this run") from None
+        except OSError:  # some network file systems have no locks
+            pass
     for part in run.folder.glob("*.part"):
         part.unlink()  # of a process that was killed while it wrote
     if args.capture_video:
@@ -1595,7 +1615,8 @@ def report(args: Args, run: Run, logs: dict[str, float], episodes: dict[str, lis
     if run.eval_envs is not None and (iteration % args.eval_interval == 0 or iteration == iterations):
         for name, scores in level_scores(args, run).items():
             logs[f"eval/{name}"] = scores.mean().item()
-            run.writer.add_tensor(f"eval_levels/{name}", scores, run.step)
+            with writing_to(run.folder):
+                run.writer.add_tensor(f"eval_levels/{name}", scores, run.step)
     logs, episodes, run.stop = combine_processes(all_gather((logs, episodes, run.received_signal)))
     write_logs(args, run, logs, episodes)
     if iteration * args.keep_models // iterations > (iteration - 1) * args.keep_models // iterations:
@@ -1711,7 +1732,8 @@ def write_file(saved: dict[str, Any], path: Path) -> None:
             os.replace(part, path)
             flush_to_disk(path.parent)  # its new name
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # a disk that cannot be written has been told of
+            part.unlink(missing_ok=True)
 
 
 def flush_to_disk(path: Path) -> None:
@@ -1735,8 +1757,9 @@ def save_checkpoint(args: Args, run: Run) -> None:
     run_state["optimizer"] = run.optimizer.state_dict()
     run_state["processes"] = map_nested(processes, np.ndarray, torch.from_numpy)  # weights_only loads no arrays
     write_file(model_of(args, run) | run_state, run.folder / f"checkpoint-{run.step}.pt")
-    for path in checkpoints_in(run.folder)[:-2]:
-        path.unlink()
+    with writing_to(run.folder):
+        for path in checkpoints_in(run.folder)[:-2]:
+            path.unlink()
 
 
 def state_of_process(run: Run) -> dict[str, Any]:
@@ -1852,12 +1875,10 @@ def read_model(path: str | Path) -> dict[str, Any]:
     """
     if not os.path.isfile(path):
         raise OSError(f"there is no file {path}; --save-model writes model.pt to the run folder")
+    content = io.BytesIO(Path(path).read_bytes())
     try:
-        with open(path, "rb") as file:
-            saved = torch.load(file, map_location="cpu", weights_only=True)
+        saved = torch.load(content, map_location="cpu", weights_only=True)
         return {**saved, "script": saved["script"], "args": dict(saved["args"]), "weights": dict(saved["weights"])}
-    except OSError:
-        raise
     except Exception:  # what torch.load raises for a file of another kind is many things, and none tells more
         raise ValueError(f"{path} is cut short, or neither a model nor a checkpoint") from None
 
@@ -1982,53 +2003,25 @@ def first_occurrences(obs: dict[str, Tensor]) -> Tensor:
     return torch.tensor([first.setdefault(each, index) for index, each in enumerate(hashes)])
 
 
-def speed_up(agent: Agent, args: Args, obs: dict[str, np.ndarray]) -> None:
-    """Replace the forward functions of the agent's layers by faster ones; obs (N, ...) are any observations.
-
-    Raises ValueError if --compile fails.
-    """
-    on_cpu = next(agent.parameters()).device.type == "cpu"
-    for cnn in agent.encoder.cnns:
-        plain = cnn.forward
-        if args.compile:
-            cnn.forward = torch.compile(plain, dynamic=not on_cpu)
-        if on_cpu:
-            cnn.forward = in_chunks(cnn.forward, plain)
-    if on_cpu and agent.decoder is not None:
-        agent.decoder.forward = in_chunks(agent.decoder.forward, agent.decoder.forward)
-    if args.compile:
-        for layers in (agent.heads.trunk, agent.heads.policy, agent.heads.value):
-            layers.compile(dynamic=True)
-    if args.amp and on_cpu:
+def speed_up(agent: Agent, args: Args) -> None:
+    """Replace the forward functions of the agent's layers by faster ones, where it is on a CPU."""
+    if next(agent.parameters()).device.type != "cpu":
+        return
+    for images in (*agent.encoder.cnns, *filter(None, [agent.decoder])):
+        images.forward = in_chunks(images.forward)
+    if args.amp:
         agent.encoder.forward = pad_batch(agent.encoder.forward)
         agent.heads.forward = pad_batch(agent.heads.forward)
-    if args.compile:
-        compile_now(agent, args, obs)
-
-
-def compile_now(agent: Agent, args: Args, obs: dict[str, np.ndarray]) -> None:
-    """Run what is to be compiled once, on a full chunk; raise ValueError if the compiler fails."""
-    device = next(agent.parameters()).device
-    chunk = {name: part[:1].expand(CHUNK, *part.shape[1:]) for name, part in as_tensors(obs, device).items()}
-    try:
-        with autocast(args, device):
-            features = agent.encoder(chunk)
-            agent.heads(features.new_zeros(len(features), agent.memory.width))
-    except Exception as error:  # whatever the compiler raises
-        raise ValueError(f"--compile: {error}; install a C++ compiler (g++), or leave --compile out") from None
 
 
 CHUNK = 256  # images; the backward pass of 2,048 at once takes about 1.5 times as long on a CPU, for its caches
 
 
-def in_chunks(forward: Callable, forward_rest: Callable) -> Callable:
-    """Return a function that maps (B, ...) in chunks; the last one, if it is smaller, by forward_rest.
-
-    On a CPU the compiled function is for one size; the rest would be compiled again for every size that it has.
-    """
+def in_chunks(forward: Callable) -> Callable:
+    """Return a function that maps (B, ...) chunk by chunk."""
 
     def chunked(x: Tensor) -> Tensor:
-        parts = [forward(part) if len(part) == CHUNK else forward_rest(part) for part in x.split(CHUNK)]
+        parts = [forward(part) for part in x.split(CHUNK)]
         return torch.cat(parts) if len(parts) > 1 else parts[0]
 
     return chunked

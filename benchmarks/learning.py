@@ -35,6 +35,8 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
+
 import evaluate
 
 ROOT = Path(__file__).parent.parent
@@ -216,13 +218,22 @@ class Plan:
         return {"script": Path(self.command[1]).stem, **texts}
 
 
+def check(config: Training) -> None:
+    """Raise SystemExit for numbers that no training can have."""
+    for name in ("jobs", "evaluations"):
+        if getattr(config, name) < 1:
+            raise SystemExit(f"--{name} is {getattr(config, name)}; it must be 1 or more")
+    if not 0 < config.steps_scale < math.inf:
+        raise SystemExit(f"--steps-scale is {config.steps_scale}; it must be a number above 0")
+    if not config.seeds or len(set(config.seeds)) < len(config.seeds):
+        raise SystemExit(f"--seeds is {' '.join(map(str, config.seeds)) or 'empty'}; give at least one, and each once")
+
+
 def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
     """Plan a training run; an agent is a name in `AGENTS`, which further flags may follow.
 
-    Raises SystemExit for flags that the script does not have, or a share of the steps that is not above 0.
+    Raises SystemExit for flags that the script does not have, or that belong to the suite.
     """
-    if config.steps_scale <= 0:
-        raise SystemExit(f"--steps-scale is {config.steps_scale}; it must be above 0")
     name, dashes, further = agent.partition(" --")
     script, *memory = AGENTS[name].split()
     steps = str(int(task.total_timesteps * config.steps_scale))
@@ -232,6 +243,8 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
     flags += ["--exp-name", file_name(agent), "--seed", str(seed)]
     flags += f"{dashes}{further}".split()
     args = importlib.import_module(Path(script).stem).parse_args(flags)
+    if (args.env_id, args.exp_name, args.seed) != (task.env_id, file_name(agent), seed):
+        raise SystemExit(f"{agent}: an agent has no task, name or seed of its own; use --tasks and --seeds")
     iterations = args.total_timesteps // (args.num_envs * args.num_steps)
     args.eval_interval = max(1, iterations // config.evaluations)
     flags += ["--eval-interval", str(args.eval_interval)]
@@ -245,7 +258,7 @@ def runs_in(place: str, plan: Plan) -> list[evaluate.RunLog]:
     for path in sorted(glob.glob(f"{place}/{plan.task.env_id}__{file_name(plan.agent)}__{plan.seed}__*")):
         with contextlib.suppress(evaluate.NoCurvesError):
             found.append(evaluate.read_run(path))
-    return [run for run in found if {**run.args, "resume": "None"} == wanted]
+    return [run for run in found if wanted.items() <= {**run.args, "resume": "None"}.items()]  # older ones have more
 
 
 def result_of(config: Training, plan: Plan) -> evaluate.RunLog | None:
@@ -437,16 +450,15 @@ def overview(tasks: dict[str, evaluate.Runs]) -> str:
 def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
     """Return the trainings that are wanted, by task, the agent's name in tables, and seed.
 
-    Raises SystemExit for names that this program does not know, no seed, and what cannot be planned.
+    Raises SystemExit for names that this program does not know, and for what `check` and `plan` refuse.
     """
+    check(config)
     suite_tasks, suite_agents = SUITES[config.suite]
     tasks = config.tasks or suite_tasks
     agents = {name: suite_agents.get(name, name) for name in config.agents} or suite_agents
-    if not config.seeds:
-        raise SystemExit("--seeds is empty; give at least one")
     for given, known in ((tasks, TASKS), ([agent.partition(" --")[0] for agent in agents.values()], AGENTS)):
         if unknown := [name for name in given if name not in known]:
-            raise SystemExit(f"there is no {unknown[0]}; there are {', '.join(known)}")
+            raise SystemExit(f"there is no {unknown[0]!r}; there are {'; '.join(known)}")
     return {
         (task, name, seed): plan(config, TASKS[task], agent, seed)
         for task in tasks

@@ -1,5 +1,6 @@
 """Bad input ends in one line that says what is wrong and what would be right, and writes nothing."""
 
+import errno
 import glob
 import os
 import re
@@ -112,11 +113,21 @@ def test_infinity_is_no_limit(tiny):
 
 def test_two_runs_do_not_share_a_folder(tiny, monkeypatch):
     """Even when both have named it before either made it."""
-    ppo_gru.setup(tiny(env_id="CueRecall-v0"))
-    (folder,) = ppo_gru.Path("runs").iterdir()
-    monkeypatch.setattr(ppo_gru, "new_folder", lambda args: folder)
-    with pytest.raises(OSError, match="File exists"):
-        ppo_gru.setup(tiny(env_id="CueRecall-v0"))
+    first = ppo_gru.setup(tiny(env_id="CueRecall-v0")).folder
+    names = iter([first, first.with_name("another")])
+    monkeypatch.setattr(ppo_gru, "new_folder", lambda args: next(names))
+    assert ppo_gru.setup(tiny(env_id="CueRecall-v0")).folder == first.with_name("another")
+
+
+def test_a_file_system_without_locks(tiny, monkeypatch):
+    if ppo_gru.fcntl is None:
+        pytest.skip("this system has no locks either")
+
+    def flock(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(ppo_gru.fcntl, "flock", flock)
+    assert ppo_gru.setup(tiny(env_id="CueRecall-v0")).folder.is_dir()
 
 
 def test_as_many_minibatches_as_steps_without_memory(tiny):
@@ -129,7 +140,8 @@ def test_what_does_not_fit(tiny, monkeypatch, error):
         raise error
 
     monkeypatch.setattr(ppo_gru.Rollout, "allocate", full)
-    message = setup_error(tiny(env_id="CueRecall-v0", num_envs=128, frame_stack=7, total_timesteps=4096))
+    changes = {"num_envs": 128, "frame_stack": 7, "total_timesteps": 4096, "checkpoint_interval": 100}
+    message = setup_error(tiny(env_id="CueRecall-v0", update_epochs=9, **changes))
     assert message == "this does not fit in the memory of cpu; use less of --frame-stack 7 --num-envs 128"
 
 
@@ -146,6 +158,7 @@ def test_tracking_that_does_not_start(tiny, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(init=init))
     message = setup_error(tiny(env_id="CueRecall-v0", track=True))
     assert message == "--track: no API key; log in with `wandb login`, or leave --track out"
+    assert not glob.glob("runs/*")
 
 
 def test_a_run_folder_that_cannot_be_written(tmp_path, tiny):
@@ -217,12 +230,8 @@ def test_a_training_that_diverges(tiny, script):
     assert message == "spoilt.pt holds weights that are not finite: the training diverged"
 
 
-def test_a_compiler_that_is_missing(tiny, monkeypatch):
-    def fail(*_, **__):
-        raise RuntimeError("no working C++ compiler")
-
-    monkeypatch.setattr(ppo_gru.Heads, "forward", fail)
-    message = setup_error(tiny(env_id="CueRecall-v0", compile=True))
-    assert message.startswith(
-        "--compile: no working C++ compiler; install a C++ compiler (g++), or leave --compile out"
-    )
+@pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
+def test_a_choice_that_there_is_not(tiny, script):
+    """On the command line tyro finds it."""
+    with pytest.raises(ValueError, match="--norm-adv is 'yes'; it must be one of none, minibatch, batch"):
+        script.check_args(tiny(script, norm_adv="yes"))

@@ -50,6 +50,15 @@ def test_a_lane_plays_its_level_once(played, script, monkeypatch):
         assert found["commands_completed"][lane] == info["commands_completed"]
 
 
+@SCRIPTS
+def test_an_environment_s_own_return(played, script, monkeypatch):
+    """What its last info calls so does not replace the sum of the rewards."""
+    args, run, *_ = played(script=script, env_id="MortarMayhemB-Grid-v0", **FEW)
+    before = evaluated(script, args, run)
+    monkeypatch.setattr(script, "final_numbers", lambda infos, done: [("return", done, np.full(done.sum(), -77.0))])
+    assert (evaluated(script, args, run)["return"] == before["return"]).all()
+
+
 def test_the_memory_is_carried_from_stretch_to_stretch(played):
     """Episodes longer than a stretch: the window's cache, refreshed, is what it was."""
     args, run, *_ = played(script=ppo_trxl, env_id="MysteryPath-Grid-v0", weights_scale=5.0, eval_max_steps=40, **FEW)

@@ -86,24 +86,6 @@ def test_ratio_is_nearly_one_in_bfloat16(played, memory):
     assert values.dtype == run.rollout.log_probs.dtype == torch.float32
 
 
-@pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
-def test_ratio_is_nearly_one_when_compiled(played, script):
-    """The rollout's four frames are not compiled, the update's 256 are."""
-    changes = {"num_steps": 64, "num_minibatches": 1, "total_timesteps": 256, "weights_scale": 3.0}
-    _, run, *_ = played(script=script, env_id="MortarMayhem-Grid-v0", compile=True, **changes)
-    assert (recompute(run)[1] - 1).abs().max() < 1e-4
-    plain = script.make_agent(run.envs, {}, script.Args(**{**SMALL[script], "cuda": False}), torch.device("cpu"))
-    plain.load_state_dict(run.agent.state_dict())  # the same names: a checkpoint does not tell
-    x = torch.randint(0, 256, (300, 84, 84, 3), dtype=torch.uint8)
-    torch.testing.assert_close(run.agent.encoder({"observation": x}), plain.encoder({"observation": x}))
-
-
-def test_what_is_compiled_runs_first_without_an_embedding_too(played):
-    """Of 3,136 features, the memory makes as many as it is wide."""
-    args, run, *_ = played(env_id="MortarMayhem-Grid-v0", embedding=False)
-    ppo_gru.compile_now(run.agent, args, run.rollout.next_obs)  # raises what fails
-
-
 @each_memory(WITH_MEMORY)
 def test_ratio_error_sees_a_broken_memory(played, memory):
     """Guards the guard: with what the memory stored lost, the ratios are off."""

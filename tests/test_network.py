@@ -71,9 +71,8 @@ def test_chunks_do_not_change_the_features(monkeypatch):
     cnn, pixels = AtariCNN(3), torch.randint(0, 256, (10, 84, 84, 3), dtype=torch.uint8)
     whole, sizes = cnn(pixels), []
     monkeypatch.setattr(ppo_gru, "CHUNK", 3)
-    forward, rest = ((lambda x, name=name: (sizes.append((name, len(x))), cnn(x))[1]) for name in ("whole", "rest"))
-    torch.testing.assert_close(in_chunks(forward, rest)(pixels), whole)
-    assert sizes == [("whole", 3)] * 3 + [("rest", 1)]
+    torch.testing.assert_close(in_chunks(lambda x: (sizes.append(len(x)), cnn(x))[1])(pixels), whole)
+    assert sizes == [3, 3, 3, 1]
 
 
 def test_rows_are_rounded_up_in_bfloat16_and_change_nothing():
@@ -84,7 +83,7 @@ def test_rows_are_rounded_up_in_bfloat16_and_change_nothing():
     pixels[:5] = torch.randint(0, 256, (5, 84, 84, 3))
     taken, found = [], []
     agent.encoder.cnns[0].register_forward_pre_hook(lambda _, inputs: taken.append(len(inputs[0])))
-    speed_up(agent, args, {"observation": pixels.numpy()})
+    speed_up(agent, args)
     for rows in (5, 16):
         agent.zero_grad()
         with torch.autocast("cpu", torch.bfloat16):
@@ -97,6 +96,22 @@ def test_rows_are_rounded_up_in_bfloat16_and_change_nothing():
     assert taken == [16, 16]
     for got, want in zip(*found, strict=True):
         torch.testing.assert_close(got, want, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("scheme", ["xavier", "orthogonal", "kaiming", "tfixup"])
+def test_every_matrix_of_a_gate_is_initialized_alike(scheme):
+    """As if each had a layer of its own."""
+    torch.manual_seed(0)
+    block = ppo_trxl.Block(ppo_trxl.Args(trxl_dim=128, trxl_gate="gru"))
+    ppo_trxl.block_init(block, scheme, 3)
+    want = block.attention.query.weight.std().item()
+    for gate in (block.merge_attention, block.merge_output):
+        matrices = torch.cat([gate.from_y.weight, gate.from_x.weight, gate.candidate.weight]).split(128)
+        assert len(matrices) == 6
+        assert [matrix.std().item() for matrix in matrices] == pytest.approx([want] * 6, rel=0.05)
+        if scheme == "orthogonal":
+            for matrix in matrices:
+                torch.testing.assert_close(matrix @ matrix.T, torch.eye(128), atol=1e-5, rtol=0)
 
 
 def test_bytes_are_scaled_to_one():

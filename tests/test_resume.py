@@ -1,5 +1,6 @@
 """A run that stops and goes on gives, to the last bit, the curves of the run that never stopped."""
 
+import errno
 import os
 import pickle
 import re
@@ -398,6 +399,35 @@ def test_no_room_for_curves():
     line = limited(20_000, *FEW, "--total-timesteps", "9600", "--checkpoint-interval", "0")
     said = r"ppo_gru\.py: iteration \d+: cannot write to runs/\S+ \(File too large\); there is no checkpoint yet"
     assert re.fullmatch(said, line), line
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_no_room_for_an_evaluation(tiny, monkeypatch, script):
+    """A defect of the disk that TensorBoard's thread found before is raised by whatever is logged next."""
+    args = tiny(script, env_id="CueRecall-v0", eval_interval=1, eval_levels=2, save_model=True)
+    run = script.setup(args)
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(run.writer, "add_tensor", full)
+    message = r"iteration 1: cannot write to .* \(No space left on device\); there is no checkpoint yet"
+    with pytest.raises(script.RunError, match=message):
+        script.run_to_end(args, run)
+    assert not (run.folder / "model.pt").exists()
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_disk_that_became_read_only(tiny, monkeypatch, script):
+    run = script.setup(tiny(script, env_id="CueRecall-v0"))
+
+    def read_only(*_, **__):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    for name in ("write_bytes", "unlink"):
+        monkeypatch.setattr(script.Path, name, read_only)
+    with pytest.raises(script.RunError, match="Read-only file system"):
+        script.write_file({"weights": {}}, run.folder / "model.pt")
 
 
 def test_no_room_for_a_checkpoint(curves):

@@ -3,6 +3,7 @@
 import glob
 import math
 import os
+import random
 import re
 import subprocess
 import sys
@@ -58,6 +59,23 @@ class Image(gym.Env):
 
 
 gym.register("Image-v0", entry_point=Image)
+
+
+class GlobalGenerators(gym.Env):
+    """Draws from NumPy's and Python's own generators, as older environments do."""
+
+    observation_space = gym.spaces.Box(0.0, 1.0, (1,))
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.random.rand(1).astype(np.float32), {}  # noqa: NPY002
+
+    def step(self, action):
+        return np.random.rand(1).astype(np.float32), 0.0, random.random() < 0.2, False, {}  # noqa: NPY002
+
+
+gym.register("GlobalGenerators-v0", entry_point=GlobalGenerators)
 
 
 class Faulty(gym.Env):
@@ -139,10 +157,11 @@ def test_episodes_are_counted_across_rollouts(played):
     assert episodes["charts/episodic_return"] == episodes["episode/right"]
 
 
+@pytest.mark.parametrize("env_id", ["MortarMayhemB-Grid-v0", "GlobalGenerators-v0"])
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_same_seed_same_curves(tiny, curves, script):
+def test_same_seed_same_curves(tiny, curves, script, env_id):
     first, second, other = (
-        curves(script.main(tiny(script, env_id="MortarMayhemB-Grid-v0", exp_name=name, seed=seed)))
+        curves(script.main(tiny(script, env_id=env_id, exp_name=name, seed=seed)))
         for name, seed in (("a", 1), ("b", 1), ("c", 2))
     )
     for name in first:
