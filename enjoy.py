@@ -27,7 +27,7 @@ from torch import Tensor, nn
 import ppo_gru
 import ppo_trxl
 from evaluate import script_of
-from memory_gym_envs.making import final_numbers, is_memory_gym, parse_options
+from memory_gym_envs.making import check_draws, final_numbers, is_memory_gym, parse_options
 
 try:
     from PIL import Image
@@ -280,6 +280,7 @@ def load(path: str) -> tuple[nn.Module, gym.vector.VectorEnv, Any]:
     saved = ppo_gru.read_model(path)
     script = script_of(saved, path)
     args = replace(script.saved_args(saved), amp=False)  # one lane is little work; not every processor has bfloat16
+    check_draws("enjoy.py", args.env_id)
     envs = script.environments(args, 1, render_mode="debug_rgb_array")
     _, infos = envs.reset(options=parse_options(args.env_id, args.env_options))
     agent = script.make_agent(envs, infos, args, torch.device("cpu"))
@@ -293,8 +294,8 @@ def main(config: Config) -> str:
         raise ImportError('enjoy.py needs plotly and pillow: pip install -e ".[eval]"')
     if not 1 <= config.max_steps <= 100_000:
         raise ValueError(f"--max-steps is {config.max_steps}; it must be from 1 to 100000")
-    if config.seed is not None and config.seed < 0:
-        raise ValueError(f"--seed is {config.seed}; it must be 0 or more")
+    if config.seed is not None and not 0 <= config.seed < 2**63:
+        raise ValueError(f"--seed is {config.seed}; it must be from 0 to 2 ** 63 - 1")
     out = Path(config.out)
     if not out.parent.is_dir():
         raise OSError(f"--out is {out}, but there is no folder {out.parent}")
@@ -335,3 +336,5 @@ if __name__ == "__main__":
         print(main(tyro.cli(Config)))
     except (ValueError, OSError, ImportError, gym.error.Error) as error:
         sys.exit(f"enjoy.py: {' '.join(str(error).split())}")
+    except KeyboardInterrupt:
+        sys.exit(130)

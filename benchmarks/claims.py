@@ -18,11 +18,15 @@ runs are missing.
 
 import itertools
 import signal
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import tyro
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
 
 import evaluate
 import learning
@@ -273,7 +277,11 @@ def row(name: str, config: Config, plans: list[learning.Plan]) -> str:
 
 
 def main(config: Config) -> None:
-    """Train what is missing, then print a row for each claim. Raises SystemExit for names that are not in CLAIMS."""
+    """Train what is missing, then print a row for each claim. Raises SystemExit for names that are not in CLAIMS.
+
+    Raises it for what `learning.check` refuses, too.
+    """
+    learning.check(config)
     if unknown := [name for name in config.claims if name not in CLAIMS]:
         raise SystemExit(f"there is no claim {unknown[0]}; there are {', '.join(CLAIMS)}")
     plans = {}

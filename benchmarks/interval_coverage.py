@@ -7,7 +7,12 @@ played three times. The true score is the IQM over the episodes of a great many 
 Markdown table.
 """
 
+import sys
+from pathlib import Path
+
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
 
 from evaluate import RESAMPLES, interval, iqm
 

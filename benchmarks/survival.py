@@ -26,6 +26,8 @@ import numpy as np
 import torch
 import tyro
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
+
 import evaluate
 
 FLAGS = "--preset laptop --env-id MysteryPath-Grid-v0 --num-envs 4 --num-steps 32 --num-minibatches 2 --no-cuda"

@@ -62,6 +62,8 @@ import numpy as np
 import torch
 import tyro
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
+
 from evaluate import SCRIPTS
 from learning import SMALL, TASKS, Task
 from ppo_gru import as_flags, flag

@@ -42,6 +42,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         start_level: the first of those n levels.
         obs_type: "pixels" (the id's own observation space) or "vector": a flat (V,) float32 vector of what the frame
             shows, and of nothing that it hides; no frame is drawn then. `variant.entries` says what is in it.
+        options: reset parameters that are this environment's defaults, for resets that do not give them.
 
     Raises ValueError for any other argument value.
 
@@ -69,6 +70,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         num_levels: int | None = None,
         start_level: int = 0,
         obs_type: str = "pixels",
+        options: Mapping[str, Any] | None = None,
     ):
         if variant not in self.variants:
             raise ValueError(f"variant must be one of {', '.join(self.variants)}, not {variant!r}")
@@ -92,7 +94,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         self._rngs: list[np.random.Generator | None] = [None] * self.num_envs
         self._level_rngs: list[np.random.Generator | None] = [None] * self.num_envs
         self._seeds: list[int | None] = [None] * self.num_envs
-        self.defaults = resolve(self.variant.options, None, variant)
+        self.defaults = resolve(self.variant.options, options, variant)
         self.settings = [self.defaults] * self.num_envs  # each lane's reset options, never changed in place
         self.ready = False
         self.allocate()
@@ -250,7 +252,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         """The complete reset options. Raises ValueError for a wrong one."""
         if options is None:
             return self.defaults
-        return resolve(self.variant.options, options, self.variant_id)
+        return resolve(self.variant.options, options, self.variant_id, self.defaults)
 
     def restart(self, lanes: np.ndarray, seeds: list[int | None], settings: dict[str, Any]) -> None:
         """An explicit reset of the lanes with these checked seeds (one for every lane of N) and options."""

@@ -143,11 +143,13 @@ def load_state(envs: VectorEnv, state: dict[str, Any]) -> None:
     No reset is needed before or after. The state remains the caller's: later steps do not change it.
 
     Raises ValueError if the state is of other environments: of another id, number of lanes, choice of levels or kind of
-    observation, or with other wrappers. Nothing has changed then.
+    observation, or with other wrappers; and for what is no state. Nothing has changed then.
     """
     parts = saved_parts(envs)
     if parts is None:
         raise ValueError(f"{envs.spec.id} has parts of other packages, whose state cannot be set")
+    if not isinstance(state, dict) or state.keys() != {"environments", "parts"}:
+        raise ValueError(f"this is no state of environments: {brief(state)}")
     ours, theirs = describe(parts), state["environments"]
     for name in ours | theirs:
         if ours.get(name) != theirs.get(name):
@@ -159,7 +161,12 @@ def load_state(envs: VectorEnv, state: dict[str, Any]) -> None:
 
 
 def saved_parts(envs: VectorEnv) -> list[Saved] | None:
-    """The environment and its wrappers that have a state, from the inside out; None if one's is not known."""
+    """The environment and its wrappers that have a state, from the inside out; None if one's is not known.
+
+    Raises ValueError for a single environment.
+    """
+    if not isinstance(envs, VectorEnv):
+        raise ValueError(f"a state is that of a vector environment, by make_envs or gym.make_vec, not of {envs}")
     parts: list[Saved] = []
     layers = [envs]
     while isinstance(layers[-1], VectorWrapper):
@@ -195,7 +202,13 @@ def find_spec(env_id: str) -> EnvSpec:
         importlib.import_module(module)
     if name not in gym.registry and (near := difflib.get_close_matches(name, gym.registry, n=1)):
         raise gym.error.NameNotFound(f"there is no environment {name}; the nearest is {near[0]}")
-    return gym.spec(name)
+    try:
+        return gym.spec(name)
+    except (gym.error.NameNotFound, gym.error.NamespaceNotFound) as error:
+        if module:
+            raise
+        hint = "if it is another package's, say which module registers it: module:id"
+        raise type(error)(f"{one_line(error)} {hint}") from None
 
 
 def is_memory_gym(env_id: str) -> bool:
@@ -323,7 +336,10 @@ def branch_actions(envs: VectorEnv) -> VectorEnv:
     sizes = branch_sizes(space)
 
     def to_env(actions: np.ndarray) -> np.ndarray:
-        actions = actions + space.start  # the first action's number, 0 unless the space says otherwise
+        if np.shape(actions) != (envs.num_envs, len(sizes)):
+            shape = f"({envs.num_envs}, {len(sizes)}), lanes and branches"
+            raise ValueError(f"actions must be integers of shape {shape}, not {brief(actions)}")
+        actions = np.asarray(actions) + space.start  # the first action's number, 0 unless the space says otherwise
         return actions[:, 0] if isinstance(space, gym.spaces.Discrete) else actions
 
     return TransformAction(envs, to_env, single_action_space=gym.spaces.MultiDiscrete(sizes))
@@ -548,11 +564,16 @@ class LaneVideo(Saved, RecordVideo):
 
 def check_can_film(env_id: str) -> None:
     """Raise ImportError without the extra `play`, ValueError if the environment says that it draws no pictures."""
-    spec = find_spec(env_id)
     try:
         importlib.import_module("moviepy")
     except ImportError:
         raise ImportError('--capture-video needs moviepy: pip install -e ".[play]"') from None
+    check_draws("--capture-video", env_id)
+
+
+def check_draws(what: str, env_id: str) -> None:
+    """Raise ValueError, which begins with what needs them, if the environment says that it draws no pictures."""
+    spec = find_spec(env_id)
     metadata = getattr(creator(spec.entry_point or spec.vector_entry_point), "metadata", None)
     if metadata is not None and "rgb_array" not in metadata.get("render_modes", ()):
-        raise ValueError(f"--capture-video needs an environment that draws pictures (rgb_array); {spec.id} draws none")
+        raise ValueError(f"{what} needs an environment that draws pictures (rgb_array); {spec.id} draws none")

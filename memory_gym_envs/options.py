@@ -83,8 +83,10 @@ class Option:
         return number if low <= number <= high or number in self.also else None
 
 
-def resolve(options: tuple[Option, ...], given: Mapping[str, Any] | None, owner: str) -> dict[str, Any]:
-    """Completes the given reset options with the defaults.
+def resolve(
+    options: tuple[Option, ...], given: Mapping[str, Any] | None, owner: str, defaults: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """Completes the given reset options with the defaults: the options' own, unless other ones are given.
 
     Raises ValueError, in one line, for an unknown name (with the nearest valid one) or a value outside its range.
     `owner` is the id that the message names.
@@ -92,7 +94,7 @@ def resolve(options: tuple[Option, ...], given: Mapping[str, Any] | None, owner:
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(f"{owner}: options must be a dictionary or None, not {brief(given)}")
     table = {option.name: option for option in options}
-    values = {name: option.parse(option.default) for name, option in table.items()}
+    values = dict(defaults or {name: option.parse(option.default) for name, option in table.items()})
     for name, value in (given or {}).items():
         if name not in table:
             near = table[difflib.get_close_matches(brief(name), table, n=1, cutoff=0.0)[0]]

@@ -7,13 +7,14 @@ import gymnasium as gym
 import numpy as np
 
 from memory_gym_envs.base import ALL, RENDER_MODES
+from memory_gym_envs.options import brief
 
 
 class MemoryGymEnv(gym.Env):
     """A single environment of any id of this package; `gym.make(id)` returns it.
 
     Arguments: the id, then those of `MemoryGymVectorEnv` but for num_envs, e.g. render_mode, num_levels, start_level,
-    obs_type.
+    obs_type, options.
     Observations, actions, rewards, options and infos are those of the id, as its family's class describes them.
     """
 
@@ -32,8 +33,11 @@ class MemoryGymEnv(gym.Env):
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts a new episode: the observation and {"ground_truth": (G,) float64}.
 
-        seed: the level to play; None: the generator goes on (or num_levels chooses). options: reset parameters, for
-        this episode. Raises ValueError for a wrong seed or option; nothing has changed then.
+        seed: the level to play; None: the generator goes on (or num_levels chooses).
+        options: reset parameters, for this episode alone. Whatever resets without them, as Gymnasium's vector
+            environments do, goes on with those that the environment was made with.
+
+        Raises ValueError for a wrong seed or option; nothing has changed then.
         """
         if isinstance(seed, (list, tuple, np.ndarray)):
             raise ValueError(f"seed must be an integer or None, not {seed!r}")
@@ -51,7 +55,12 @@ class MemoryGymEnv(gym.Env):
             raise gym.error.ResetNeeded("call reset() before step(), at the start and after every episode's end")
         batch = self.batch
         lone = action[None] if isinstance(action, (np.ndarray, np.integer)) else [action]
-        rewards, terminations, truncations = batch.advance(batch.checked_actions(lone))
+        try:
+            actions = batch.checked_actions(lone)
+        except ValueError:
+            space = self.action_space
+            raise ValueError(f"{batch.variant_id}: the action must be in {space}, not {brief(action)}") from None
+        rewards, terminations, truncations = batch.advance(actions)
         terminated, truncated = bool(terminations[0]), bool(truncations[0])
         info: dict[str, Any] = {}
         if terminated or truncated:

@@ -371,7 +371,7 @@ def test_bad_input_is_one_line(saved):
     ("config", "message"),
     [
         ({"checkpoint": enjoy.__file__}, "enjoy.py is cut short, or neither a model nor a checkpoint"),
-        ({"seed": -1}, "--seed is -1; it must be 0 or more"),
+        ({"seed": -1}, "--seed is -1; it must be from 0 to 2 ** 63 - 1"),
         ({"max_steps": 0}, "--max-steps is 0; it must be from 1 to 100000"),
         ({"out": "nowhere/page.html"}, "there is no folder nowhere"),
         ({"out": "."}, "directory"),
@@ -387,7 +387,7 @@ def test_bad_input(config, message, saved):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"env_id": "CueRecall-v0"}, "CueRecall-v0 cannot be made: .*render_mode"),
+        ({"env_id": "CueRecall-v0"}, r"enjoy\.py needs .* that draws pictures \(rgb_array\); CueRecall-v0 draws none"),
         ({"env_options": '{"agent_scal": 1}'}, "agent_scal.*agent_scale"),
         ({"obs_type": "vector"}, "holds the weights of another network"),
     ],

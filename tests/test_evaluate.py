@@ -566,13 +566,29 @@ def test_metrics_that_every_episode_told():
         evaluate.choose_metrics(("success",), "MysteryPath-v0", [told, cut])
 
 
+def test_a_metric_that_one_of_two_tasks_has(tiny, capsys):
+    """The other one gets a line, and what was played is kept."""
+    paths = []
+    for env_id in ("MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"):
+        paths.append(str(ppo_gru.main(tiny(env_id=env_id, obs_type="vector", save_model=True)) / "model.pt"))
+    few = {"levels": 1, "repeats": 1, "cuda": False}
+    evaluate.main(evaluate.Config(tuple(paths), metrics=("commands_completed",), json="scores.json", **few))
+    (task,) = json.loads(Path("scores.json").read_text())
+    assert task["task"].startswith("MortarMayhemB-Grid-v0")
+    assert "MysteryPath-Grid-v0, levels 100000 to 100000, 1 times each: not every" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="no task tells coins"):
+        evaluate.main(evaluate.Config(tuple(paths), metrics=("coins",), **few))
+
+
 # ---- bad input ----
 BAD = {
     "": "give either checkpoints to play with .* or --curves",
     "a.pt --curves runs": "give either checkpoints",
     "nowhere.pt": "there is no file nowhere.pt",
     "notes.txt": "notes.txt is cut short, or neither a model nor a checkpoint",
-    "MODEL --levels 0": "--levels is 0; it must be 1 or more",
+    "MODEL --levels 0": r"--levels is 0; it must be from 1 to 2 \*\* 63 - 1",
+    "MODEL --seed 99999999999999999999": r"--seed is 99999999999999999999; it must be from 0 to 2 \*\* 63 - 1",
+    "cut.pt": "cut.pt is cut short, or neither a model nor a checkpoint",
     "MODEL --max-steps 0": "--max-steps is 0",
     "MODEL --json no/where.json": "there is no folder no to write to",
     "MODEL --metrics coins": "not every episode told coins; they told return, length, reward",
@@ -587,6 +603,8 @@ BAD = {
 
 def test_bad_input(agents, tmp_path):
     (tmp_path / "notes.txt").write_text("some notes")
+    content = Path(f"{agents[0]}/model.pt").read_bytes()
+    (tmp_path / "cut.pt").write_bytes(content[: len(content) // 2])  # torch raises an OSError without a file's name
     (tmp_path / "empty").mkdir()
     (tmp_path / "results").mkdir()
     (tmp_path / "results/run.json.gz").touch()

@@ -15,6 +15,7 @@ import pytest
 import torch
 from tqdm import tqdm
 
+import claims
 import evaluate
 import learning
 import ppo_gru
@@ -40,18 +41,31 @@ def test_an_agent_may_have_further_flags(tmp_path):
     assert args.trxl_memory_gradient
     assert (args.trxl_num_layers, args.trxl_positional_encoding) == (3, "learned")  # the task's own flags come first
     assert args.exp_name == "TrXL-gradient-trxl-num-layers-3-trxl-positional-encoding-learned"
-    with pytest.raises(SystemExit, match=r"there is no TrXXL; there are no memory, stack of 4, .*GRU"):
+    with pytest.raises(SystemExit, match=r"there is no 'TrXXL'; there are no memory; stack of 4; .*GRU"):
         learning.main(learning.Config(agents=("GRU", "TrXXL --trxl-num-layers 3"), folder=tmp_path))
 
 
-def test_there_is_a_seed():
-    with pytest.raises(SystemExit, match="--seeds is empty; give at least one"):
-        learning.main(learning.Config(seeds=()))
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"seeds": ()}, "--seeds is empty; give at least one, and each once"),
+        ({"seeds": (1, 2, 1)}, "--seeds is 1 2 1; give at least one, and each once"),
+        ({"jobs": 0}, "--jobs is 0; it must be 1 or more"),
+        ({"evaluations": 0}, "--evaluations is 0; it must be 1 or more"),
+        ({"steps_scale": 0}, "--steps-scale is 0; it must be a number above 0"),
+        ({"steps_scale": float("nan")}, "--steps-scale is nan; it must be a number above 0"),
+    ],
+)
+def test_numbers_that_no_training_can_have(wrong, message):
+    for program in (learning, claims):
+        with pytest.raises(SystemExit, match=message):
+            program.main(program.Config(report=True, **wrong))
 
 
-def test_a_share_of_the_steps_is_above_0():
-    with pytest.raises(SystemExit, match="--steps-scale is 0; it must be above 0"):
-        learning.plan(learning.Config(steps_scale=0), learning.TASKS["mortar-mayhem"], "GRU", 1)
+@pytest.mark.parametrize("flags", ["--seed 3", "--exp-name mine", "--env-id MysteryPath-v0"])
+def test_an_agent_has_no_task_name_or_seed_of_its_own(flags):
+    with pytest.raises(SystemExit, match=f"GRU {flags}: an agent has no task, name or seed of its own; use --tasks"):
+        learning.plan(learning.Config(), learning.TASKS["mortar-mayhem"], f"GRU {flags}", 1)
 
 
 def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, capsys):

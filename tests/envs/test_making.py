@@ -173,6 +173,21 @@ def test_same_seed_same_episodes(env_id):
         assert differs
 
 
+@pytest.mark.parametrize("env_id", ["MysteryPath-Grid-v0", "CartPole-v1"])
+def test_actions_of_another_shape(env_id):
+    envs = make_envs(env_id, 2, seed=1)
+    envs.reset()
+    for wrong in (np.zeros(2, int), np.zeros((2, 2), int), 0, None):
+        with pytest.raises(ValueError, match=r"actions must be integers of shape \(2, 1\), lanes and branches, not "):
+            envs.step(wrong)
+
+
+@pytest.mark.parametrize("env_id", ["Faraway-v0", "ALE/Pang-v5"])
+def test_an_id_whose_module_is_not_named(env_id):
+    with pytest.raises(gym.error.Error, match="say which module registers it: module:id"):
+        making.find_spec(env_id)
+
+
 @pytest.mark.parametrize("env_id", VECTORS)
 def test_vectors_are_as_wide_as_documented(env_id):
     space = make_envs(needs(env_id), 1).single_observation_space

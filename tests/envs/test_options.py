@@ -26,6 +26,30 @@ def test_options_stay_until_the_next_explicit_reset(env_id):
     assert all((step[1] >= 0).all() for step in roll(envs, 200))
 
 
+@EACH
+def test_options_that_an_environment_is_made_with(env_id):
+    """They are its defaults: Gymnasium's own vector environment, which resets without options, keeps them."""
+    hasty = HASTY[FAMILY[env_id]]
+    envs = make(env_id, options=hasty)
+    assert envs.defaults == make(env_id).resolve(hasty)
+    envs.reset(seed=0, options={"agent_scale": 0.5})
+    assert envs.settings == [make(env_id).resolve({**hasty, "agent_scale": 0.5})] * LANES
+    envs.reset(seed=0)
+    same_step = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
+    theirs = gym.make_vec(env_id, LANES, vectorization_mode="sync", vector_kwargs=same_step, options=hasty)
+    theirs.reset(seed=0)
+    ended = 0
+    for actions in (envs.action_space.sample() for _ in range(100)):
+        ours, other = envs.step(actions), theirs.step(actions)
+        ended += (ours[2] | ours[3]).sum()
+        check_same(ours[0], other[0])
+        for mine, their in zip(ours[1:4], other[1:4], strict=True):
+            np.testing.assert_array_equal(mine, their)
+    assert ended > LANES
+    with pytest.raises(ValueError, match=r"'agent_skale'.*'agent_scale'"):
+        make(env_id, options={"agent_skale": 1})
+
+
 WRONG_ANYWHERE = [
     ({"agent_skale": 1.0}, "'agent_skale'.*'agent_scale'.*a number from 0.04 to 1.0"),
     ({"agent_scale": 0}, "'agent_scale'.*a number from 0.04 to 1.0"),

@@ -4,6 +4,7 @@ import copy
 import io
 
 import cue_recall  # noqa: F401 (registers CueRecall-v0)
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -288,6 +289,17 @@ def test_a_state_of_another_version():
 def test_a_generator_of_no_known_kind():
     with pytest.raises(ValueError, match="unknown kind, 'seed'"):
         restored({"bit_generator": "seed"})
+
+
+def test_what_is_no_state():
+    envs = make_envs("MysteryPath-v0", 2)
+    envs.reset(seed=0)
+    for wrong in (None, {}, {"environments": {}}, "state"):
+        with pytest.raises(ValueError, match="this is no state of environments: "):
+            load_state(envs, wrong)
+    for attempt in (save_state, lambda env: load_state(env, save_state(envs))):
+        with pytest.raises(ValueError, match=r"a vector environment, by make_envs or gym\.make_vec, not of <"):
+            attempt(gym.make("MysteryPath-v0"))
 
 
 def test_environments_of_others_have_no_state():
