@@ -182,7 +182,7 @@ def test_actions_of_another_shape(env_id):
             envs.step(wrong)
 
 
-@pytest.mark.parametrize("env_id", ["Faraway-v0", "ALE/Pang-v5"])
+@pytest.mark.parametrize("env_id", ["Qqqqqqqqqqqq-v0", "Xxxxxxxxxxxx/Qqqqqqqqqqqq-v5"])
 def test_an_id_whose_module_is_not_named(env_id):
     with pytest.raises(gym.error.Error, match="say which module registers it: module:id"):
         making.find_spec(env_id)
