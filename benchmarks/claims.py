@@ -36,6 +36,7 @@ MORTAR_MAYHEM, MYSTERY_PATH = TASKS["mortar-mayhem"], TASKS["mystery-path"]
 FULL_MORTAR_MAYHEM, FULL_SPOTLIGHTS = TASKS["MortarMayhem-Grid-v0"], TASKS["SearingSpotlights-v0"]
 ENDLESS = TASKS["endless-mortar-mayhem"]
 LONG_ENDLESS = replace(ENDLESS, total_timesteps=12_000_000)
+FULL_ENDLESS = TASKS["Endless-MortarMayhem-v0"]
 ENDLESS_MYSTERY_PATH, ENDLESS_SPOTLIGHTS = TASKS["Endless-MysteryPath-v0"], TASKS["Endless-SearingSpotlights-v0"]
 COMMANDS_IN_VIEW = replace(
     MORTAR_MAYHEM,
@@ -183,6 +184,10 @@ CLAIMS = {
     "endless-long": Claim(
         "6.3", "the same with as many parameters, after 12 million steps", LONG_ENDLESS,
         ("GRU",), (WIDE_QUERY_POSITION,),
+    ),
+    "endless-full": Claim(
+        "6.3", "GRU completes more commands than TrXL in the full Endless Mortar Mayhem", FULL_ENDLESS,
+        ("GRU",), (WIDE_TRXL,),
     ),
     "endless-mystery-path": Claim(
         "6.3", "GRU has a higher return than TrXL in Endless Mystery Path", ENDLESS_MYSTERY_PATH,
