@@ -9,7 +9,7 @@ Runs whose arguments differ in nothing but the seed are the seeds of one agent. 
 steps of the training, are agents of their own. As in the thesis (6.1.2, 6.1.3), every seed plays 50 levels outside its
 training set, three times each. An agent's score is the interquartile mean (IQM): the mean of the middle half of all
 episodes of its seeds, as the thesis pools 750 of them. Beside it stands the IQM of the levels' means, which is another
-number: where 70 % of the episodes succeed, the middle half has hardly a failure, but many a level has a mean below 1.
+number: where 70 % of the episodes succeed, the middle half has hardly a failure, but many levels have means below 1.
 The 95 % interval is that of a bootstrap that resamples whole seeds: how far the IQM would move with other seeds. Of
 three seeds it is no more than the range of their IQMs. A single seed has none.
 
@@ -338,7 +338,7 @@ def hyperparameters(events: EventAccumulator) -> dict[str, str]:
 def with_defaults(given: dict[str, str]) -> dict[str, str]:
     """Return a run's arguments as today's version has them.
 
-    An argument that is younger than the run has its default, one that no longer exists is left out.
+    An argument that is newer than the run has its default, one that no longer exists is left out.
     """
     if given.get("norm_adv") in ("True", "False"):  # before it was a choice
         given = given | {"norm_adv": "minibatch" if given["norm_adv"] == "True" else "none"}
@@ -625,12 +625,12 @@ def title_of(args: dict[str, Any]) -> str:
 def choose_metrics(wanted: tuple[str, ...], env_id: str, played: list[dict[str, np.ndarray]]) -> list[str]:
     """Return the metrics to report: those wanted, else the family's own, return, length and falls.
 
-    Only what every episode told can be averaged; one that was cut short tells return and length so far, and no more.
-    Raises ValueError for a wanted metric that they did not all tell.
+    Only what every episode reported can be averaged; one that was cut short has return and length so far, and no more.
+    Raises ValueError for a wanted metric that they did not all report.
     """
     known = [name for name in played[0] if all(name in each and not np.isnan(each[name]).any() for each in played)]
     if unknown := [name for name in wanted if name not in known]:
-        raise ValueError(f"not every episode told {unknown[0]}; they told {', '.join(known)}")
+        raise ValueError(f"not every episode reported {unknown[0]}; all reported {', '.join(known)}")
     usual = dict.fromkeys([own_metric(env_id), "return", "length", "num_fails"])
     return list(wanted) or [name for name in usual if name in known]
 
@@ -638,7 +638,7 @@ def choose_metrics(wanted: tuple[str, ...], env_id: str, played: list[dict[str, 
 def score_checkpoints(config: Config) -> list[dict[str, Any]]:
     """Play the levels with every checkpoint's agent; print a table for each task, and return what is in it.
 
-    A task that does not tell the wanted metrics gets a line instead. Raises ValueError if none does.
+    A task that does not report the wanted metrics gets a line instead. Raises ValueError if none does.
     """
     checkpoints = {path: Checkpoint.read(path, config) for path in dict.fromkeys(config.checkpoints)}
     arguments = {path: checkpoint.arguments() for path, checkpoint in checkpoints.items()}
@@ -664,7 +664,7 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
         if finished < 1:
             print(f"--max-steps cut {1 - finished:.2%} of the episodes; what only their end tells is left out\n")
     if not report:
-        raise ValueError(f"no task tells {', '.join(config.metrics)}")
+        raise ValueError(f"no task reports {', '.join(config.metrics)}")
     return report
 
 
@@ -681,6 +681,8 @@ def main(config: Config) -> None:
     for path in (config.json, config.out):
         if path is not None and not os.path.isdir(os.path.dirname(path) or "."):
             raise ValueError(f"there is no folder {os.path.dirname(path)} to write to")
+    if config.json is not None and os.path.isdir(config.json):
+        raise ValueError(f"--json {config.json} is a folder; give a file to write to")
     report = draw_curves(config) if config.curves else score_checkpoints(config)
     if config.json is not None:
         with open(config.json, "w") as file:

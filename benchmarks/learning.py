@@ -8,7 +8,7 @@ The small suite has tasks that take minutes on a core; the full one has the ten 
 vector observations and small networks, and all see the same vectors, a frame stack the last few. Scores are those of
 evaluations during training, on levels outside the training set (6.1.3).
 
-What a run reached is kept in a file of some KB in --results, which `evaluate.py --curves` can draw too. A run whose
+What a run reached is kept in a file of a few KB in --results, which `evaluate.py --curves` can draw too. A run whose
 file is there is not trained again; one that was stopped goes on from its last checkpoint in --folder. With --report,
 nothing is trained.
 """
@@ -24,6 +24,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import zlib
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, field, replace
@@ -127,7 +128,7 @@ SMALL = {
         },
     ),
 }
-FULL = {  # trained for what two cores can do in a day, all agents and seeds together; few come to rest in it
+FULL = {  # trained for what two cores can do in a day, all agents and seeds together; few agents converge
     # As in the small task, an agent has to tell tiles apart to remember them.
     env_id: Task(env_id, 1_000_000 * millions, flags="--vector-frequencies 4" if "MysteryPath" in env_id else "")
     for env_id, millions in {
@@ -174,7 +175,7 @@ class Training:
     folder: Path = Path("learning")
     """where the runs go"""
     results: Path = Path("learning/results")
-    """where a file of some KB goes for every finished run"""
+    """where a file of a few KB goes for every finished run"""
     report: bool = False
     """train nothing, show the results that are there"""
 
@@ -234,17 +235,31 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
 
     Raises SystemExit for flags that the script does not have, or that belong to the suite.
     """
+    steps = int(task.total_timesteps * config.steps_scale)
+    of_the_suite = {
+        "env_id": task.env_id,
+        "env_options": json.dumps(task.options),
+        "total_timesteps": steps,
+        "exp_name": file_name(agent),
+        "seed": seed,
+    }
     name, dashes, further = agent.partition(" --")
     script, *memory = AGENTS[name].split()
-    steps = str(int(task.total_timesteps * config.steps_scale))
     flags = [*COMMON.split(), *memory, *task.flags.split(), *(task.trxl_flags.split() if "trxl" in script else [])]
-    flags += ["--total-timesteps", steps, "--anneal-steps", steps]
-    flags += ["--env-id", task.env_id, "--env-options", json.dumps(task.options)]
-    flags += ["--exp-name", file_name(agent), "--seed", str(seed)]
+    flags += ["--anneal-steps", str(steps)]
+    for each, value in of_the_suite.items():
+        flags += [f"--{each.replace('_', '-')}", str(value)]
     flags += f"{dashes}{further}".split()
-    args = importlib.import_module(Path(script).stem).parse_args(flags)
-    if (args.env_id, args.exp_name, args.seed) != (task.env_id, file_name(agent), seed):
-        raise SystemExit(f"{agent}: an agent has no task, name or seed of its own; use --tasks and --seeds")
+    try:
+        args = importlib.import_module(Path(script).stem).parse_args(flags)
+    except (ValueError, OSError) as error:
+        raise SystemExit(f"{agent}: {error}") from None
+    theirs = {each: getattr(args, each) for each in of_the_suite}
+    if theirs != of_the_suite or args.eval_interval or args.resume:
+        raise SystemExit(
+            f"{agent}: an agent has no task, steps, name, seed or evaluations of its own, and goes on with no other "
+            "run; use --tasks, --steps-scale, --seeds and --evaluations"
+        )
     iterations = args.total_timesteps // (args.num_envs * args.num_steps)
     args.eval_interval = max(1, iterations // config.evaluations)
     flags += ["--eval-interval", str(args.eval_interval)]
@@ -258,7 +273,7 @@ def runs_in(place: str, plan: Plan) -> list[evaluate.RunLog]:
     for path in sorted(glob.glob(f"{place}/{plan.task.env_id}__{file_name(plan.agent)}__{plan.seed}__*")):
         with contextlib.suppress(evaluate.NoCurvesError):
             found.append(evaluate.read_run(path))
-    return [run for run in found if wanted.items() <= {**run.args, "resume": "None"}.items()]  # older ones have more
+    return [run for run in found if {**run.args, "resume": "None"} == wanted]
 
 
 def result_of(config: Training, plan: Plan) -> evaluate.RunLog | None:
@@ -273,12 +288,13 @@ def is_complete(run: evaluate.RunLog) -> bool:
 
 
 RUNNING = set()  # training processes, to be stopped with this one
+STOPPING = threading.Event()
 
 
 def log_of(config: Training, plan: Plan) -> Path:
-    """Return the file that a training's output goes to: another one where only the task's options differ."""
-    task_hash = zlib.crc32(json.dumps(asdict(plan.task)).encode())
-    return config.folder / f"{plan.task.env_id}-{file_name(plan.agent)}-{plan.seed}-{task_hash:08x}.log"
+    """Return the file that a training's output goes to: another one for each command."""
+    command_hash = zlib.crc32(json.dumps(plan.command[2:]).encode())
+    return config.folder / f"{plan.task.env_id}-{file_name(plan.agent)}-{plan.seed}-{command_hash:08x}.log"
 
 
 def steps_so_far(config: Training, plan: Plan) -> int:
@@ -303,6 +319,8 @@ def train(config: Training, plan: Plan) -> None:
         how = {"cwd": config.folder, "env": environment, "stdout": output, "stderr": output, "start_new_session": True}
         with subprocess.Popen(line, **how) as process:
             RUNNING.add(process)
+            if STOPPING.is_set():  # only since this training was about to begin
+                process.terminate()
             code = process.wait()
             RUNNING.remove(process)
     if code == 0:
@@ -364,7 +382,7 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
                 for training in [each for each in trainings if each in ended]:  # in the order of the plans
                     try:
                         training.result()
-                    except SystemExit as error:
+                    except (SystemExit, OSError, ValueError) as error:
                         failed.append(str(error))
                         tqdm.write(failed[-1])
                 left = [trainings[each] for each in unfinished]
@@ -372,6 +390,7 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
                 bar.refresh()
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
+            STOPPING.set()
             for process in RUNNING.copy():
                 process.terminate()
             raise SystemExit("stopped; the same command goes on") from None

@@ -8,10 +8,14 @@ without falling off, by breadth-first search; the thesis counts those of a train
 """
 
 import argparse
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
 import memory_gym_envs  # noqa: F401 (registers the ids)
 from memory_gym_envs.character import FACINGS, PAD, free_controls, grid_controls, walk, wardrobe

@@ -12,6 +12,8 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
+
 import memory_gym_envs  # noqa: F401 (registers the ids)
 
 RED = (255, 0, 0)

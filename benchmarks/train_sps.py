@@ -15,16 +15,20 @@ On a CPU, a script encodes equal observations of a minibatch once, and may overt
 import importlib
 import os
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import torch
 import tyro
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
 
 @dataclass

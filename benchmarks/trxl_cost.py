@@ -10,13 +10,17 @@ memory alone, as the agent plays, once its window is full; the attention's is me
 import os
 import resource
 import statistics
+import sys
 import tempfile
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 import tyro
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
 import ppo_trxl
 

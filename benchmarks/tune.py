@@ -595,12 +595,13 @@ def check(config: Config) -> None:
     for name in ("trials", "jobs"):
         if getattr(config, name) < 1:
             raise ValueError(f"{flag(name)} is {getattr(config, name)}; it must be 1 or more")
-    for name in ("hours", "steps_scale"):
-        if not getattr(config, name) > 0:
-            raise ValueError(f"{flag(name)} is {getattr(config, name)}; it must be above 0")
+    if not config.hours > 0:
+        raise ValueError(f"--hours is {config.hours}; it must be above 0")
+    if not 0 < config.steps_scale < math.inf:
+        raise ValueError(f"--steps-scale is {config.steps_scale}; it must be a number above 0")
     if not 0 < config.keep <= 100:
         raise ValueError(f"--keep is {config.keep}; it must be above 0, up to 100")
-    if min(config.sampler_seed, *config.seeds) < 0:
+    if min(config.sampler_seed, 0, *config.seeds) < 0:
         raise ValueError("--sampler-seed and --seeds must be 0 or more")
     if unknown := [name for name in config.tasks if name not in TASKS]:
         raise ValueError(f"there is no task {unknown[0]}; there are {', '.join(TASKS)}")
@@ -619,7 +620,8 @@ def main(config: Config) -> None:
     """Search, unless only a report is wanted, then report. Raises ValueError or OSError, one line for the user."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     check(config)
-    config = replace(config, folder=config.folder.absolute())
+    # In one order, as the curves that a search has kept are.
+    config = replace(config, folder=config.folder.absolute(), tasks=tuple(name for name in TASKS if name in config.tasks))
     if not config.report:
         search(config)
     report(config)

@@ -3,6 +3,11 @@
 python benchmarks/vectors_page.py > docs/vectors.md
 """
 
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
+
 from memory_gym_envs import FAMILIES
 from memory_gym_envs.entries import vector_table
 

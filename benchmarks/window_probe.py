@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+import gymnasium as gym
 import numpy as np
 import tyro
 from tqdm import tqdm
@@ -52,8 +53,8 @@ def row(checkpoint: evaluate.Checkpoint, window: int, metric: str) -> str:
 
 def main(config: Config) -> None:
     """Print a table, a window a row; raise ValueError for what cannot be played, and what evaluate.py raises."""
-    if min(config.windows) < 1:
-        raise ValueError(f"--windows has {min(config.windows)}; a window is 1 step or more")
+    if not config.windows or min(config.windows) < 1:
+        raise ValueError(f"--windows is {' '.join(map(str, config.windows)) or 'empty'}; give windows of 1 step or more")
     settings = evaluate.Config(levels=config.levels, repeats=config.repeats, max_steps=config.max_steps)
     checkpoint = evaluate.Checkpoint.read(config.checkpoint, settings)
     if checkpoint.script is not ppo_trxl:
@@ -70,5 +71,5 @@ def main(config: Config) -> None:
 if __name__ == "__main__":
     try:
         main(tyro.cli(Config))
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError, gym.error.Error) as error:
         sys.exit(f"window_probe.py: {' '.join(str(error).split())}")

@@ -168,7 +168,7 @@ def test_other_tasks_are_apart():
 
 @pytest.mark.parametrize("env_id", memory_gym_envs.IDS)
 def test_own_metric_is_told_by_the_environment(env_id):
-    """6.1.3; the return is told by every evaluation."""
+    """6.1.3; every evaluation reports the return."""
     metric = evaluate.own_metric(env_id)
     envs = ppo_gru.gym.make_vec(env_id, num_envs=1)
     envs.reset(seed=0)
@@ -556,13 +556,13 @@ def test_episodes_cut_short(agents, capsys):
     assert "--max-steps cut 100.00% of the episodes" in capsys.readouterr().out
 
 
-def test_metrics_that_every_episode_told():
+def test_metrics_that_every_episode_reported():
     told = {"return": np.zeros(2), "length": np.ones(2), "finished": np.ones(2), "success": np.zeros(2)}
     assert evaluate.choose_metrics((), "MysteryPath-v0", [told, told]) == ["success", "return", "length"]
     assert evaluate.choose_metrics(("finished",), "MysteryPath-v0", [told]) == ["finished"]
     cut = told | {"success": np.array([0, np.nan])}
     assert evaluate.choose_metrics((), "MysteryPath-v0", [told, cut]) == ["return", "length"]
-    with pytest.raises(ValueError, match="not every episode told success; they told return, length, finished"):
+    with pytest.raises(ValueError, match="not every episode reported success; all reported return, length, finished"):
         evaluate.choose_metrics(("success",), "MysteryPath-v0", [told, cut])
 
 
@@ -576,7 +576,7 @@ def test_a_metric_that_one_of_two_tasks_has(tiny, capsys):
     (task,) = json.loads(Path("scores.json").read_text())
     assert task["task"].startswith("MortarMayhemB-Grid-v0")
     assert "MysteryPath-Grid-v0, levels 100000 to 100000, 1 times each: not every" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="no task tells coins"):
+    with pytest.raises(ValueError, match="no task reports coins"):
         evaluate.main(evaluate.Config(tuple(paths), metrics=("coins",), **few))
 
 
@@ -591,7 +591,8 @@ BAD = {
     "cut.pt": "cut.pt is cut short, or neither a model nor a checkpoint",
     "MODEL --max-steps 0": "--max-steps is 0",
     "MODEL --json no/where.json": "there is no folder no to write to",
-    "MODEL --metrics coins": "not every episode told coins; they told return, length, reward",
+    "MODEL --json empty": "--json empty is a folder; give a file to write to",
+    "MODEL --metrics coins": "not every episode reported coins; all reported return, length, reward",
     "--curves nowhere": "there is no run folder nowhere",
     "--curves empty": "empty holds no curves",
     "--curves results": "results is a folder of results; give the files themselves, as results/\\*.json.gz",

@@ -2,10 +2,12 @@
 
 import fcntl
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -62,10 +64,25 @@ def test_numbers_that_no_training_can_have(wrong, message):
             program.main(program.Config(report=True, **wrong))
 
 
-@pytest.mark.parametrize("flags", ["--seed 3", "--exp-name mine", "--env-id MysteryPath-v0"])
-def test_an_agent_has_no_task_name_or_seed_of_its_own(flags):
-    with pytest.raises(SystemExit, match=f"GRU {flags}: an agent has no task, name or seed of its own; use --tasks"):
+@pytest.mark.parametrize(
+    "flags",
+    [
+        "--seed 3",
+        "--exp-name mine",
+        "--env-id MysteryPath-v0",
+        "--env-options {}",
+        "--total-timesteps 5000",
+        "--eval-interval 3",
+    ],
+)
+def test_an_agent_has_no_task_of_its_own(flags):
+    with pytest.raises(SystemExit, match=f"GRU {flags}: an agent has no task, steps, name, seed or evaluations of its"):
         learning.plan(learning.Config(), learning.TASKS["mortar-mayhem"], f"GRU {flags}", 1)
+
+
+def test_an_agent_goes_on_with_no_other_run(tmp_path):
+    with pytest.raises(SystemExit, match="GRU --resume nowhere: --resume nowhere: there is no checkpoint"):
+        learning.plan(learning.Config(), learning.TASKS["mortar-mayhem"], "GRU --resume nowhere", 1)
 
 
 def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, capsys):
@@ -129,19 +146,32 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
         learning.main(replace(config, results=tmp_path / "nowhere"))
 
 
-def test_a_failed_run_stops_no_other(tmp_path, monkeypatch):
+@pytest.mark.parametrize("error", [SystemExit("seed 1 failed"), OSError(28, "No space left on device")])
+def test_a_failed_run_stops_no_other(error, tmp_path, monkeypatch):
     done = []
 
     def train(config, plan):
         done.append(plan.seed)
         if plan.seed == 1:
-            raise SystemExit("seed 1 failed: see its.log")
+            raise error
 
     monkeypatch.setattr(learning, "train", train)
     config = learning.Config(tasks=("mortar-mayhem",), agents=("GRU",), seeds=(1, 2), jobs=1, folder=tmp_path)
-    with pytest.raises(SystemExit, match=r"seed 1 failed: see its\.log; GRU on .*, seed 2, was stopped; the same"):
+    with pytest.raises(SystemExit, match=rf"{re.escape(str(error))}; GRU on .*, seed 2, was stopped; the same"):
         learning.main(config)
     assert done == [1, 2]
+
+
+def test_a_training_that_is_about_to_begin_is_stopped_too(tmp_path, monkeypatch):
+    config = learning.Config(folder=tmp_path)
+    plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", 1)
+    plan = replace(plan, command=(sys.executable, "-c", "import time; time.sleep(600)"))
+    monkeypatch.setattr(learning, "STOPPING", threading.Event())
+    learning.STOPPING.set()
+    began = time.monotonic()
+    learning.train(config, plan)
+    assert time.monotonic() - began < 300
+    assert not learning.RUNNING
 
 
 def test_runs_share_the_cores_unless_told_how_many_threads_to_have(tmp_path, monkeypatch):
@@ -178,6 +208,8 @@ def test_a_log_tells_how_far_its_training_is(tmp_path):
             assert learning.steps_so_far(config, plan) == seen
         bar.close()
     assert learning.steps_so_far(config, other) == 0, "another seed has not begun"
+    longer = learning.plan(replace(config, steps_scale=12), learning.TASKS["mortar-mayhem"], "GRU", 1)
+    assert learning.steps_so_far(config, longer) == 0, "nor has a longer training"
 
 
 def test_a_row_of_the_table():

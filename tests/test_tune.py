@@ -287,6 +287,8 @@ def test_draws_differ_from_trial_to_trial_and_from_worker_to_worker(quick):
         ({"keep": 0.0}, "--keep is 0.0"),
         ({"sampler_seed": -1}, "--sampler-seed and --seeds must be 0 or more"),
         ({"seeds": (1, -1)}, "--sampler-seed and --seeds must be 0 or more"),
+        ({"steps_scale": math.inf}, "--steps-scale is inf; it must be a number above 0"),
+        ({"seeds": ()}, "--seeds needs one or more, each of them once"),
         ({"seeds": (1, 1)}, "--seeds needs one or more, each of them once"),
         ({"tasks": ("nowhere",)}, "there is no task nowhere; there are mortar-mayhem, "),
         ({"tasks": ()}, "--tasks needs one or more"),
@@ -311,6 +313,12 @@ def test_scores_that_do_not_compare_are_not_mixed(quick, name, value):
     tune.open_study(quick)
     with pytest.raises(ValueError, match=f"another --{name.replace('_', '-')}; use another --folder"):
         tune.open_study(replace(quick, **{name: value}))
+
+
+def test_tasks_are_in_one_order(quick):
+    tune.main(replace(quick, trials=1, tasks=("mystery-path", "mortar-mayhem")))
+    tune.main(replace(quick, trials=2, tasks=("mortar-mayhem", "mystery-path")))
+    assert list(tune.load_study(quick).user_attrs["search"]["--tasks"]) == ["mortar-mayhem", "mystery-path"]
 
 
 @each_script

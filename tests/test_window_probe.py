@@ -39,7 +39,8 @@ def test_rows_of_the_windows(tiny, monkeypatch, capsys):
     ("script", "changes", "told"),
     [
         (ppo_gru, {}, r"model\.pt was trained by ppo_gru\.py; only transformers"),
-        (ppo_trxl, {"windows": (4, 0)}, "--windows has 0; a window is 1 step or more"),
+        (ppo_trxl, {"windows": (4, 0)}, "--windows is 4 0; give windows of 1 step or more"),
+        (ppo_trxl, {"windows": ()}, "--windows is empty; give windows of 1 step or more"),
         (ppo_trxl, {"windows": (4,), "max_steps": 2}, "with a window of 4, --max-steps 2 cut episodes short"),
     ],
 )
