@@ -130,7 +130,7 @@ def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, options: dict 
 
 
 def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode) -> tuple[Tensor, Any]:
-    """Do as `Agent.act` does, and add what the agent computed to the episode; return actions (1, A) and its memory."""
+    """Return actions (1, A) and memory, as `Agent.get_action_and_value` does; add what was computed to the episode."""
     x = agent.encoder(obs)
     if isinstance(agent.memory, ppo_trxl.Memory):
         episode.attention.append(attention_of(agent.memory, x, memory)[0].numpy())
@@ -153,9 +153,9 @@ def attention_of(memory: ppo_trxl.Memory, x: Tensor, state: ppo_trxl.MemoryState
     """Return what the next step, x (N, D), attends to: weights (N, K, H, M) of the last M steps, the oldest first."""
     rows, age, seen = memory.look_back(state)
     x, found = x[:, None], []  # (N, 1, D)
-    in_query = memory.in_query(state.episode_step[:, None], state.items[state.now - 1][:, None], x.dtype)
+    added_to_query = memory.added_to_query(state.episode_step[:, None], state.items[state.now - 1][:, None], x.dtype)
     for k, block in enumerate(memory.blocks):
-        added = in_query if k == 0 else 0.0
+        added = added_to_query if k == 0 else 0.0
         keys_values = state.keys[k][:, rows], state.values[k][:, rows]
         query = block.norm_query(x + added)
         found.append(attention_weights(block.attention, query, keys_values[0], age, seen)[:, :, 0])

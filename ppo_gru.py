@@ -4,10 +4,11 @@
 
 The agent gets one observation at a time and carries a hidden state from step to step, zeroed where an episode ends.
 The rollout stores the hidden state that each step began with. For the update, the steps of each environment are cut
-into sequences at the ends of episodes (and every --seq-len steps), padded with zeros to the longest sequence, and
-unrolled from the stored hidden state of their first step: truncated back-propagation through time. The gradient
-reaches back to the first step of the sequence. The hidden state that a sequence starts from was computed while acting,
-possibly with older weights; --refresh-memory recomputes it before each epoch but the first.
+into sequences at the ends of episodes (and every --seq-len steps), padded with zeros to the longest sequence (on a CPU
+packed, section 9), and unrolled from the stored hidden state of their first step: truncated back-propagation through
+time. The gradient reaches back to the first step of the sequence. The hidden state that a rollout starts from was
+computed with older weights. So are, after the first epoch, those that --seq-len starts sequences from; --refresh-memory
+recomputes these before each epoch but the first.
 
 Source: "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", called the thesis below.
 §5.2 is its section, (5.7) its equation; defaults are the "Final" column of its table 6.1.
@@ -165,7 +166,8 @@ class Args:
     gae_lambda: UnitInterval = 0.95
     """lambda of generalized advantage estimation"""
     refresh_memory: bool = False
-    """before every epoch but the first, recompute the memory that the rollout stored, with the current weights"""
+    """before every epoch but the first, recompute the memory that the rollout stored, with the current weights; where
+    the update reads none of it, only the next rollout starts from other memory (docs/memory.md)"""
     bootstrap_truncated: bool = False
     """value the final observation of an episode that a time limit cut short, instead of counting it as ended"""
     norm_adv: Literal["none", "minibatch", "batch"] = "none"
@@ -179,7 +181,8 @@ class Args:
     max_grad_norm: PositiveFloat = 0.25
     """a gradient with a larger norm is scaled down to this one"""
     target_kl: PositiveFloat | None = None
-    """end an iteration's update at the first minibatch whose KL divergence from the policy that acted exceeds this"""
+    """end an iteration's update at the first minibatch whose KL divergence from the policy that acted exceeds this,
+    which is neither learned from nor logged"""
     init_lr: UnitInterval = 2.75e-4
     """learning rate at the first step"""
     final_lr: UnitInterval = 1.0e-5
@@ -381,10 +384,10 @@ class Pieces:
     num_envs: int  # N
 
     @classmethod
-    def beginning(cls, begins: Tensor) -> "Pieces":
-        """Make pieces that begin at every step where begins (T, N) is true, as it is at t = 0."""
-        num_steps, num_envs = begins.shape
-        cuts = begins.T.flatten().nonzero()[:, 0]  # environment after environment: n * T + t
+    def from_starts(cls, starts: Tensor) -> "Pieces":
+        """Make pieces that begin at every step where starts (T, N) is true, as it is at t = 0."""
+        num_steps, num_envs = starts.shape
+        cuts = starts.T.flatten().nonzero()[:, 0]  # environment after environment: n * T + t
         length = torch.diff(cuts, append=torch.tensor([num_steps * num_envs]))
         n, t = cuts // num_steps, cuts % num_steps
         return cls(t * num_envs + n, length, num_envs)
@@ -541,16 +544,18 @@ class Decoder(nn.Sequential):
         for kernel, stride in ((8, 4), (4, 2), (3, 1)):
             sizes.append(tuple((size - kernel) // stride + 1 for size in sizes[-1]))
         # Pixels at the right and lower edge that the encoder's first two strides do not reach.
-        rest = [[(size - kernel) % stride for size in sizes[i]] for i, (kernel, stride) in enumerate(((8, 4), (4, 2)))]
+        output_padding = [
+            [(size - kernel) % stride for size in sizes[i]] for i, (kernel, stride) in enumerate(((8, 4), (4, 2)))
+        ]
         super().__init__(
             layer_init(nn.Linear(features, 64 * math.prod(sizes[3]))),
             nn.ReLU(inplace=True),
             nn.Unflatten(1, (64, *sizes[3])),
             layer_init(nn.ConvTranspose2d(64, 64, 3, 1)),
             nn.ReLU(inplace=True),
-            layer_init(nn.ConvTranspose2d(64, 32, 4, 2, output_padding=rest[1])),
+            layer_init(nn.ConvTranspose2d(64, 32, 4, 2, output_padding=output_padding[1])),
             nn.ReLU(inplace=True),
-            layer_init(nn.ConvTranspose2d(32, channels, 8, 4, output_padding=rest[0]), 1.0),
+            layer_init(nn.ConvTranspose2d(32, channels, 8, 4, output_padding=output_padding[0]), 1.0),
         )
 
     def forward(self, features: Tensor) -> Tensor:
@@ -596,6 +601,7 @@ class Memory(nn.Module):
         if args.memory != "none":
             rnn = nn.GRU if args.memory == "gru" else nn.LSTM
             # The outputs are activated already: another ReLU behind them would throw half of them away (§5.2.4).
+            # As in CleanRL, a matrix is orthogonal that stacks those of all gates; a single gate's is not.
             self.rnn = layer_init(rnn(inputs, self.width, args.num_layers, batch_first=True), 1.0)
 
     def initial_state(self, num_envs: int, num_steps: int, device: torch.device) -> MemoryState:
@@ -624,21 +630,19 @@ class Memory(nn.Module):
 
     def reset(self, state: MemoryState, done: Tensor) -> MemoryState:
         """Forget where an episode ended: done (N,), on the CPU."""
-        if not done.any():
-            return state
         return state._replace(hidden=state.hidden.masked_fill(done[:, None, None].to(state.hidden.device), 0.0))
 
     def cut(self, done: Tensor) -> Pieces:
         """Cut a rollout, whose episodes end where done (T, N) is true, into sequences."""
-        begins = torch.ones_like(done)
+        starts = torch.ones_like(done)
         if self.kind == "none":
-            return Pieces.beginning(begins)  # every step by itself
-        begins[1:] = done[:-1]
+            return Pieces.from_starts(starts)  # every step by itself
+        starts[1:] = done[:-1]
         if self.seq_len:
             t = torch.arange(len(done))[:, None]
-            began = torch.where(begins, t, 0).cummax(0).values  # (T, N) the step that the episode began at
-            begins = (t - began) % self.seq_len == 0
-        return Pieces.beginning(begins)
+            began = torch.where(starts, t, 0).cummax(0).values  # (T, N) the step that the episode began at
+            starts = (t - began) % self.seq_len == 0
+        return Pieces.from_starts(starts)
 
     def unroll(self, x: Tensor, pieces: Pieces, state: MemoryState) -> Tensor:
         """Run whole sequences: x (B, I) to (B, D), each from the stored hidden state of its first step."""
@@ -682,7 +686,9 @@ class Agent(nn.Module):
             self.decoder = Decoder(args.head_size, space.spaces) if args.reconstruction_coef else None
             self.estimator = head(args.head_size, ground_truth_size, 1.0) if args.ground_truth_coef else None
 
-    def act(self, obs: dict[str, Tensor], state: MemoryState) -> tuple[Tensor, Tensor, Tensor, MemoryState]:
+    def get_action_and_value(
+        self, obs: dict[str, Tensor], state: MemoryState
+    ) -> tuple[Tensor, Tensor, Tensor, MemoryState]:
         """Take one step of all environments.
 
         Returns actions (N, A), their log-probabilities (N, A), values (N,) and the memory's state after the step.
@@ -701,12 +707,12 @@ class Agent(nn.Module):
     def evaluate_actions(
         self, observations: "UniqueObservations", actions: Tensor, pieces: Pieces, state: MemoryState
     ) -> tuple[list[Categorical], Tensor, Tensor, Tensor]:
-        """Recompute, with gradient, what `act` computed at the steps of the pieces.
+        """Recompute, with gradient, what `get_action_and_value` computed at the steps of the pieces.
 
         Returns the policy, a distribution of B actions for each branch, the log-probabilities (B, A) of the actions
         (B, A), values (B,) and features (B, F).
         """
-        x = observations.encode(self.encoder, pieces.flat_index())  # (B, D); section 9: on a CPU, equal ones once
+        x = observations.encode(self.encoder, pieces.flat_index())  # (B, I); section 9: on a CPU, equal ones once
         logits, values, features = self.heads(self.memory.unroll(x, pieces, state))
         policy = self.heads.distributions(logits)
         return policy, log_probs_of(policy, actions), values, features
@@ -724,7 +730,7 @@ class MemoryLimit(ValueError):
 # ---- 6 TRAINING ----
 @dataclass
 class Rollout:
-    """T steps of N environments to learn from, and what the next rollout goes on with; overwritten by each."""
+    """T steps of N environments to learn from, and what the next rollout goes on with; each rollout overwrites it."""
 
     obs: dict[str, Tensor]  # each (T, N, ...): uint8 pixels stay uint8
     actions: Tensor  # (T, N, A)
@@ -798,10 +804,9 @@ def collect(
             if rollout.ground_truth is not None:
                 rollout.ground_truth[t] = torch.as_tensor(rollout.next_ground_truth)
             obs = {name: part[t] for name, part in rollout.obs.items()}
-            actions, rollout.log_probs[t], rollout.values[t], state = agent.act(obs, state)
-            rollout.actions[t] = actions
+            rollout.actions[t], rollout.log_probs[t], rollout.values[t], state = agent.get_action_and_value(obs, state)
 
-            next_obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
+            next_obs, rewards, terminated, truncated, infos = envs.step(rollout.actions[t].cpu().numpy())
             done = terminated | truncated
             rollout.rewards[t] = torch.as_tensor(rewards)
             rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
@@ -810,19 +815,15 @@ def collect(
                 value = agent.get_value(final, state)  # with the memory of the episode that ended
                 rollout.truncation_values[t] = value * rollout.truncated[t]
             state = agent.memory.reset(state, torch.as_tensor(done))
-            rollout.next_obs, rollout.next_ground_truth = next_obs, infos.get("ground_truth")
+            rollout.next_obs = next_obs
+            rollout.next_ground_truth = infos["ground_truth"] if rollout.ground_truth is not None else None
             if done.any():
-                append_episodes(episodes, infos, done)
+                episodes["charts/episodic_return"] += infos["episode"]["r"][done].tolist()
+                episodes["charts/episodic_length"] += infos["episode"]["l"][done].tolist()
+                for name, _, values in final_numbers(infos, done):
+                    episodes[f"episode/{name}"] += values.tolist()
         rollout.memory_state = state
         return agent.get_value(as_tensors(rollout.next_obs, device), state), episodes
-
-
-def append_episodes(episodes: dict[str, list[float]], infos: dict, done: np.ndarray) -> None:
-    """Append the metrics of the episodes that ended, where done (N,) is true, to the lists."""
-    episodes["charts/episodic_return"] += infos["episode"]["r"][done].tolist()
-    episodes["charts/episodic_length"] += infos["episode"]["l"][done].tolist()
-    for name, _, values in final_numbers(infos, done):
-        episodes[f"episode/{name}"] += values.tolist()
 
 
 def ppo_loss(
@@ -844,39 +845,21 @@ def ppo_loss(
         advantages = normalize(advantages)
     pg_loss = policy_loss(log_ratio, advantages, args.clip_coef)
     v_loss = value_loss(values, old_values, returns, args.clip_coef if args.clip_vloss else None)
-    bonuses = {
-        "entropy": sum(branch.entropy() for branch in policy).mean(),  # of independent branches: the sum
-        "log-barrier": log_barrier(policy),
-    }
-    loss = pg_loss + args.vf_coef * v_loss - ent_coef * bonuses[args.exploration_bonus]
-    logs = {
-        "policy_loss": pg_loss,
-        "value_loss": v_loss,
-        "entropy": bonuses["entropy"],
-        "log_barrier": bonuses["log-barrier"],
-        **policy_metrics(log_ratio, args.clip_coef),
-    }
-    for name, auxiliary in auxiliary_losses(agent, features, rollout, gather, args).items():
-        loss = loss + getattr(args, f"{name}_coef") * auxiliary
-        logs[f"{name}_loss"] = auxiliary
-    logs["loss"] = loss
-    return loss, {name: value.detach() for name, value in logs.items()}
-
-
-def auxiliary_losses(
-    agent: Agent, features: Tensor, rollout: Rollout, gather: Callable[[Tensor], Tensor], args: Args
-) -> dict[str, Tensor]:
-    """Return the losses (5.5) and (5.6) of those auxiliary heads that the agent has; features (B, F)."""
-    losses = {}
-    if agent.decoder is not None:
-        with autocast(args, features.device):
-            # (B, height, width, channels)
+    entropy = sum(branch.entropy() for branch in policy).mean()  # of independent branches: the sum
+    barrier = log_barrier(policy)
+    loss = pg_loss + args.vf_coef * v_loss - ent_coef * (entropy if args.exploration_bonus == "entropy" else barrier)
+    logs = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, "log_barrier": barrier}
+    if agent.decoder is not None:  # (5.5)
+        with autocast(args, index.device):
             logits = agent.decoder(features.detach() if args.reconstruction_detach else features)
-        losses["reconstruction"] = reconstruction_loss(logits.float(), gather(rollout.obs[agent.encoder.images[0]]))
-    if agent.estimator is not None:
+        logs["reconstruction_loss"] = reconstruction_loss(logits.float(), gather(rollout.obs[agent.encoder.images[0]]))
+        loss = loss + args.reconstruction_coef * logs["reconstruction_loss"]
+    if agent.estimator is not None:  # (5.6)
         estimate = agent.estimator((features.detach() if args.ground_truth_detach else features).float())  # (B, G)
-        losses["ground_truth"] = F.mse_loss(estimate, gather(rollout.ground_truth))
-    return losses
+        logs["ground_truth_loss"] = F.mse_loss(estimate, gather(rollout.ground_truth))
+        loss = loss + args.ground_truth_coef * logs["ground_truth_loss"]
+    logs |= {"loss": loss, **policy_metrics(log_ratio, args.clip_coef)}
+    return loss, {name: value.detach() for name, value in logs.items()}
 
 
 @torch.no_grad()
@@ -908,23 +891,30 @@ def update(
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
     clipped_together = groups_to_clip(agent, args)
     logs = []
-    for minibatch in epochs(agent, rollout, pieces, args):
-        loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
-        if args.target_kl is not None and logs:  # before the first step, the policy is still the one that acted
-            kl = np.mean(all_gather(log["approx_kl"].item()))  # section 8: over processes, so that all stop at once
-            if kl > args.target_kl:
-                break
-        optimizer.zero_grad()
-        loss.backward()
-        average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
-        norms = [nn.utils.clip_grad_norm_(group, args.max_grad_norm) for group in clipped_together]
-        log["grad_norm"] = norms[0]
-        if not torch.stack([log["loss"], *norms]).isfinite().all():
-            raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
-        optimizer.step()
-        logs.append(log)
+    for epoch in range(args.update_epochs):
+        if args.refresh_memory and epoch > 0:
+            refresh_memory(agent, rollout, args)
+        for minibatch in pieces.minibatches(args.num_minibatches):
+            loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
+            if args.target_kl is not None and logs:  # before the first step, the policy is still the one that acted
+                kl = np.mean(all_gather(log["approx_kl"].item()))  # section 8: of all processes, which stop together
+                if kl > args.target_kl:
+                    break
+            optimizer.zero_grad()
+            loss.backward()
+            average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
+            norms = [nn.utils.clip_grad_norm_(group, args.max_grad_norm) for group in clipped_together]
+            log["grad_norm"] = norms[0]
+            if not torch.stack([log["loss"], *norms]).isfinite().all():
+                raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
+            optimizer.step()
+            logs.append(log)
+        else:
+            continue  # with the next epoch
+        break  # --target-kl was exceeded
 
-    losses = mean_log(logs)
+    means = torch.stack([torch.stack([*log.values()]) for log in logs]).mean(0)  # over minibatches; asks a GPU once
+    losses = dict(zip(logs[0], means.tolist(), strict=True))
     # Before the first gradient step the weights are those that acted, so every ratio has to be 1.
     losses["ratio_error"] = logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
@@ -936,27 +926,13 @@ def update(
 def groups_to_clip(agent: Agent, args: Args) -> list[list[nn.Parameter]]:
     """Return the parameters whose gradients are clipped together: the agent's first, then each detached head's.
 
-    A detached head only asks what the features hold: if its gradient had a share of the norm, it would change the step
-    of all others.
+    A detached head is a probe of what the features hold: if its gradient had a share of the norm, clipping would change
+    the agent's step.
     """
     heads = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
     probes = [[*head.parameters()] for head, detached in heads if head is not None and detached]
     in_probes = {*itertools.chain(*probes)}
     return [[parameter for parameter in agent.parameters() if parameter not in in_probes], *probes]
-
-
-def epochs(agent: Agent, rollout: Rollout, pieces: Pieces, args: Args) -> Iterator[Pieces]:
-    """Yield the minibatches of all epochs; before each epoch but the first, refresh the memory if that is wanted."""
-    for epoch in range(args.update_epochs):
-        if args.refresh_memory and epoch > 0:
-            refresh_memory(agent, rollout, args)
-        yield from pieces.minibatches(args.num_minibatches)
-
-
-def mean_log(logs: list[dict[str, Tensor]]) -> dict[str, float]:
-    """Return the mean of each metric over the minibatches; a GPU is asked for all of them at once."""
-    means = torch.stack([torch.stack([*log.values()]) for log in logs]).mean(0)
-    return dict(zip(logs[0], means.tolist(), strict=True))
 
 
 def train(args: Args, run: "Run") -> None:
@@ -1022,14 +998,14 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
         for t in range(args.eval_max_steps):
             if t % memory_steps == 0:
                 state = agent.memory.begin_rollout(state)
-            actions, _, _, state = agent.act(as_tensors(obs, device), state)
+            actions, _, _, state = agent.get_action_and_value(as_tensors(obs, device), state)
             obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
             done = terminated | truncated
             state = agent.memory.reset(state, torch.as_tensor(done))
             found["return"] += rewards * playing
             found["length"] += playing
             for name, which, values in final_numbers(infos, done & playing):
-                if name not in ("return", "length"):  # which are the sums above, whatever the environment calls so
+                if name not in ("return", "length"):  # counted above; the environment's own of these names are ignored
                     found.setdefault(name, np.full(len(levels), np.nan))[which] = values
             playing &= ~done
             if not playing.any():
@@ -1296,8 +1272,8 @@ def make_folder(args: Args, run: Run) -> None:
 def open_logs(args: Args, run: Run) -> None:
     """Open the TensorBoard file, which hides what was logged beyond the run's step, and the progress bar."""
     run.writer = SummaryWriter(str(run.folder), purge_step=run.step + 1 if run.step else None)
-    told = {"script": Path(__file__).stem, **asdict(args)}
-    rows = "\n".join(f"|{key}|{' '.join(str(value).split())}|" for key, value in told.items())
+    hyperparameters = {"script": Path(__file__).stem, **asdict(args)}
+    rows = "\n".join(f"|{key}|{' '.join(str(value).split())}|" for key, value in hyperparameters.items())
     run.writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}", run.step)
     batch_size = args.num_envs * args.num_steps
     total = args.total_timesteps // batch_size * batch_size
@@ -1446,7 +1422,7 @@ def write_file(saved: dict[str, Any], path: Path) -> None:
             os.replace(part, path)
             flush_to_disk(path.parent)  # its new name
     finally:
-        with contextlib.suppress(OSError):  # a disk that cannot be written has been told of
+        with contextlib.suppress(OSError):  # the error of writing is being raised already
             part.unlink(missing_ok=True)
 
 
@@ -1601,8 +1577,6 @@ def saved_args(saved: dict[str, Any]) -> Args:
     """Return the arguments in what `read_model` read; a flag that is newer than the file has its default."""
     known = {each.name for each in fields(Args)}
     given = {name: value for name, value in saved["args"].items() if name in known}
-    if isinstance(given.get("norm_adv"), bool):  # before it was a choice
-        given["norm_adv"] = "minibatch" if given["norm_adv"] else "none"
     return Args(**given)
 
 
@@ -1698,7 +1672,7 @@ class UniqueObservations:
         self.first_occurrence = first_occurrences(self.obs) if agent.encoder.images and on_cpu else None
 
     def encode(self, encoder: Encoder, index: Tensor) -> Tensor:
-        """Encode the observations at the flat indices (B,): (B, D)."""
+        """Encode the observations at the flat indices (B,): (B, I)."""
         inverse = None
         if self.first_occurrence is not None:
             index, inverse = self.first_occurrence[index].unique(return_inverse=True)

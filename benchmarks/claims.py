@@ -11,10 +11,10 @@ there.
 A claim compares pairs of agents. It holds if, in all pairs, each seed of one agent is better than each of the other; it
 does not hold if, in some pair, each is worse; otherwise, and with fewer than three seeds, it is not decided. Where the
 thesis says that agents are no better than others, that is contradicted if one is, with each of its seeds. With three
-seeds each, chance alone separates two equal agents in each direction in one of twenty pairs. A claim of several pairs is
-harder to confirm and easier to refute: of two agents against four, all equal, chance alone hardly ever makes it hold,
-and makes it not hold in a quarter of the cases. With --report nothing is trained, and a claim is not tested if runs are
-missing.
+seeds each, chance alone separates two equal agents in each direction in one of twenty pairs. A claim of several pairs
+is harder to confirm and easier to refute: of two agents against four, all equal, chance alone hardly ever makes it
+hold, and makes it not hold in a quarter of the cases. With --report nothing is trained, and a claim is not tested if
+runs are missing.
 """
 
 import itertools

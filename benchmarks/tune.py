@@ -620,8 +620,8 @@ def main(config: Config) -> None:
     """Search, unless only a report is wanted, then report. Raises ValueError or OSError, one line for the user."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     check(config)
-    # In one order, as the curves that a search has kept are.
-    config = replace(config, folder=config.folder.absolute(), tasks=tuple(name for name in TASKS if name in config.tasks))
+    tasks = tuple(name for name in TASKS if name in config.tasks)  # in one order, as the curves of a search are
+    config = replace(config, folder=config.folder.absolute(), tasks=tasks)
     if not config.report:
         search(config)
     report(config)

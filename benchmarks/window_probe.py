@@ -54,7 +54,8 @@ def row(checkpoint: evaluate.Checkpoint, window: int, metric: str) -> str:
 def main(config: Config) -> None:
     """Print a table, a window a row; raise ValueError for what cannot be played, and what evaluate.py raises."""
     if not config.windows or min(config.windows) < 1:
-        raise ValueError(f"--windows is {' '.join(map(str, config.windows)) or 'empty'}; give windows of 1 step or more")
+        given = " ".join(map(str, config.windows)) or "empty"
+        raise ValueError(f"--windows is {given}; give windows of 1 step or more")
     settings = evaluate.Config(levels=config.levels, repeats=config.repeats, max_steps=config.max_steps)
     checkpoint = evaluate.Checkpoint.read(config.checkpoint, settings)
     if checkpoint.script is not ppo_trxl:

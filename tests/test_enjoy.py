@@ -126,7 +126,7 @@ def test_the_episode_is_the_agents(flags, saved, monkeypatch):
         assert np.array_equal(episode.truth[t], infos["ground_truth"][0])
         with torch.no_grad():
             used.clear()
-            taken, log_probs, value, memory = agent.act(ppo_gru.as_tensors(obs, cpu), memory)
+            taken, log_probs, value, memory = agent.get_action_and_value(ppo_gru.as_tensors(obs, cpu), memory)
         assert episode.values[t] == value.item()
         assert episode.policy[t][0][actions[0]] == pytest.approx(log_probs.exp().item())
         assert np.array_equal(episode.attention[t], torch.stack(used).numpy())

@@ -33,8 +33,8 @@ def test_levels_follow_the_training_set(tiny, script):
 def test_a_lane_plays_its_level_once(played, script, monkeypatch):
     """The same actions in single environments with the levels' seeds earn the same."""
     args, run, *_ = played(script=script, env_id="MortarMayhemB-Grid-v0", **FEW)
-    taken, act = [], run.agent.act
-    monkeypatch.setattr(run.agent, "act", lambda *given: (taken.append(act(*given)), taken[-1])[1])
+    taken, act = [], run.agent.get_action_and_value
+    monkeypatch.setattr(run.agent, "get_action_and_value", lambda *given: (taken.append(act(*given)), taken[-1])[1])
     found = evaluated(script, args, run)
     assert (found["finished"] == 1).all()
     for lane, level in enumerate(script.evaluation_levels(args)):

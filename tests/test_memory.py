@@ -283,7 +283,7 @@ def test_truncation_bootstraps_with_the_final_observation_and_the_memory_before_
     envs.reset(options=options)
     with torch.no_grad():
         for t in range(5):
-            *_, state = run.agent.act({"observation": rollout.obs["observation"][t]}, state)
+            *_, state = run.agent.get_action_and_value({"observation": rollout.obs["observation"][t]}, state)
             *_, infos = envs.step(rollout.actions[t].numpy())
         final = {"observation": torch.from_numpy(np.stack([obs["observation"] for obs in infos["final_obs"]]))}
         value = run.agent.get_value(final, state)
@@ -369,7 +369,7 @@ def test_acting_and_learning_ask_no_device_for_numbers(played, monkeypatch, memo
     obs = {name: part[0] for name, part in rollout.obs.items()}
     with NoQuestions(), torch.no_grad():
         state = agent.memory.begin_rollout(state)
-        *_, state = agent.act(obs, state)
+        *_, state = agent.get_action_and_value(obs, state)
         agent.get_value(obs, state)
     observations, optimizer = script.UniqueObservations(rollout.obs, agent), torch.optim.SGD(agent.parameters())
     for minibatch in pieces.minibatches(2):
@@ -410,7 +410,9 @@ def test_a_refreshed_memory_is_that_of_a_rollout_with_the_present_weights(played
     with torch.no_grad():
         state, wanted = agent.memory.begin_rollout(agent.memory.rewind(state)), []
         for t in range(args.num_steps):
-            _, _, value, state = agent.act({name: part[t] for name, part in rollout.obs.items()}, state)
+            _, _, value, state = agent.get_action_and_value(
+                {name: part[t] for name, part in rollout.obs.items()}, state
+            )
             wanted.append(value)
             state = agent.memory.reset(state, rollout.terminated[t] | rollout.truncated[t])
     index, _, values = recompute(run)
@@ -425,3 +427,26 @@ def test_memory_is_refreshed_before_every_epoch_but_the_first(tiny, script, monk
     changes = {"env_id": "CueRecall-v0", "update_epochs": 3, "total_timesteps": 64}
     script.main(tiny(script, refresh_memory=True, **changes))
     assert "".join(calls) == "llrllrll"
+
+
+@pytest.mark.parametrize(
+    ("reads", "script", "changes"),
+    [
+        (False, ppo_gru, {}),
+        (False, ppo_gru, {"memory": "lstm"}),
+        (True, ppo_gru, {"seq_len": 3}),
+        (True, ppo_trxl, {}),
+        (False, ppo_trxl, {"trxl_memory_gradient": True}),
+        (True, ppo_trxl, {"trxl_memory_gradient": True, "trxl_segment_length": 3}),
+    ],
+)
+def test_which_updates_read_refreshed_memory(tiny, reads, script, changes):
+    """As docs/memory.md says: the first update is another one where it reads what was refreshed."""
+    changes |= {"env_id": "Endless-MortarMayhem-v0", "obs_type": "vector", "total_timesteps": 64, "init_lr": 1e-2}
+    weights = []
+    for refresh in (False, True):
+        args = tiny(script, refresh_memory=refresh, num_minibatches=1, **changes)
+        run = script.setup(args)
+        script.run_to_end(args, run)
+        weights.append(torch.cat([weight.flatten() for weight in run.agent.state_dict().values()]))
+    assert weights[0].equal(weights[1]) == (not reads)

@@ -338,8 +338,6 @@ def test_a_checkpoint_with_the_weights_in_another_order(trained):
     torch.save(saved, path)
     with pytest.raises(ValueError, match=r"of a version with the weights in another order, .*; --load-model takes"):
         resumed(ppo_gru, trained, "--total-timesteps", "256")
-    torch.save({**saved, "args": saved["args"] | {"norm_adv": True}}, path)
-    assert ppo_gru.saved_args(ppo_gru.read_model(path)).norm_adv == "minibatch", "as it was before it was a choice"
 
 
 def test_weights_alone_are_no_checkpoint(trained):
