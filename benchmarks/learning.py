@@ -520,4 +520,9 @@ def main(config: Config) -> None:
 
 if __name__ == "__main__":
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
-    main(tyro.cli(Config))
+    try:
+        main(tyro.cli(Config))
+    except OSError as error:
+        sys.exit(f"learning.py: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)

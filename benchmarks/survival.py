@@ -135,7 +135,7 @@ def soak(config: Config) -> None:
     script.close(run)
     print(f"\n{config.script}, a checkpoint after each of {config.soak} iterations\n")
     print("| iterations | resident memory, MiB | open files | steps per second |\n|---|---:|---:|---:|")
-    for part in np.array_split(np.arange(config.soak), 5):
+    for part in np.array_split(np.arange(config.soak), min(5, config.soak)):
         memory, files, rate = np.array(rows)[part].T
         print(f"| {part[0] + 1} to {part[-1] + 1} | {memory.max():.1f} | {files.max():.0f} | {np.median(rate):.0f} |")
 
