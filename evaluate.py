@@ -380,7 +380,10 @@ def curve_name(metric: str, runs: list[RunLog]) -> str:
         if name in common:
             return name
     known = ", ".join(sorted(name for name in common if name.startswith(("eval/", "episode/", "charts/episodic_"))))
-    raise ValueError(f"the runs have no curve of {metric} in common; they all have {known or 'none of an episode yet'}")
+    raise ValueError(
+        f"the runs of {task_of(runs[0].args)} have no curve of {metric} in common; they all have "
+        f"{known or 'none of an episode yet'}"
+    )
 
 
 def align(runs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:

@@ -596,7 +596,7 @@ BAD = {
     "--curves nowhere": "there is no run folder nowhere",
     "--curves empty": "empty holds no curves",
     "--curves results": "results is a folder of results; give the files themselves, as results/\\*.json.gz",
-    "--curves RUN --metrics coins": "no curve of coins in common; they all have .*eval/success",
+    "--curves RUN --metrics coins": "of MysteryPath-Grid-v0 .* no curve of coins .* all have .*eval/success",
     "--curves RUN --out no/where": "there is no folder no to write to",
     "--curves old --over time": "old has no charts/seconds_iteration, .*; draw it --over steps, or leave it out",
 }
