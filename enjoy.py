@@ -27,7 +27,7 @@ from torch import Tensor, nn
 import ppo_gru
 import ppo_trxl
 from evaluate import script_of
-from memory_gym_envs.making import check_draws, final_numbers, is_memory_gym, parse_options
+from memory_gym_envs.making import check_draws, final_numbers, is_memory_gym
 
 try:
     from PIL import Image
@@ -106,14 +106,14 @@ class Episode:
 
 # ---- PLAY ----
 @torch.no_grad()
-def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, options: dict | None, max_steps: int) -> Episode:
+def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, max_steps: int) -> Episode:
     """Play one episode, or max_steps of it, in the only lane of `envs`: fresh memory, stochastic policy.
 
-    Raises ValueError for options that the environment does not have, or an episode that the memory cannot hold.
+    Raises ValueError for an episode that the memory cannot hold.
     """
     torch.manual_seed(seed)
     episode = Episode()
-    obs, infos = envs.reset(seed=seed, options=options)
+    obs, infos = envs.reset(seed=seed)
     memory = agent.memory.begin_rollout(agent.memory.initial_state(1, max_steps, torch.device("cpu")))
     while not episode.finished and len(episode.actions) < max_steps:
         for name, frame in views(envs, obs).items():
@@ -282,7 +282,7 @@ def load(path: str) -> tuple[nn.Module, gym.vector.VectorEnv, Any]:
     args = replace(script.saved_args(saved), amp=False)  # one lane is little work; not every processor has bfloat16
     check_draws("enjoy.py", args.env_id)
     envs = script.environments(args, 1, render_mode="debug_rgb_array")
-    _, infos = envs.reset(options=parse_options(args.env_id, args.env_options))
+    _, infos = envs.reset()
     agent = script.make_agent(envs, infos, args, torch.device("cpu"))
     script.load_weights(agent, saved, path)
     return agent, envs, args
@@ -301,8 +301,7 @@ def main(config: Config) -> str:
         raise OSError(f"--out is {out}, but there is no folder {out.parent}")
     agent, envs, args = load(config.checkpoint)
     seed = args.start_level + args.num_levels if config.seed is None else config.seed
-    options = parse_options(args.env_id, args.env_options)
-    episode = play(agent, envs, seed, options, config.max_steps)
+    episode = play(agent, envs, seed, config.max_steps)
     facts = summary(episode, args, seed)
     out.write_text(page(page_data(episode, args.env_id, facts), get_plotlyjs()), encoding="utf-8")
     size = out.stat().st_size / 1e6

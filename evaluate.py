@@ -610,7 +610,7 @@ def play(checkpoint: Checkpoint, seed: int) -> dict[str, np.ndarray]:
     script, args = checkpoint.script, checkpoint.args
     device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
     envs = script.environments(args, args.eval_levels * args.eval_repeats)
-    _, infos = envs.reset(options=script.parse_options(args.env_id, args.env_options))
+    _, infos = envs.reset()
     agent = script.make_agent(envs, infos, args, device)
     script.load_weights(agent, checkpoint.saved, checkpoint.path)
     torch.manual_seed(seed)

@@ -989,8 +989,8 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
     an episode's final info. The memory begins empty, and has room for memory_steps steps at a time.
     """
     levels = evaluation_levels(args)
-    device, options = next(agent.parameters()).device, parse_options(args.env_id, args.env_options)
-    obs, _ = envs.reset(seed=levels, options=options)
+    device = next(agent.parameters()).device
+    obs, _ = envs.reset(seed=levels)
     state = agent.memory.initial_state(len(levels), memory_steps, device)
     playing = np.ones(len(levels), bool)
     found = {"return": np.zeros(len(levels)), "length": np.zeros(len(levels))}
@@ -1122,9 +1122,10 @@ def check_args(args: Args) -> None:
 
 def environments(args: Args, num_envs: int, **kwargs: Any) -> gym.vector.VectorEnv:
     """Make the environments that the arguments describe; kwargs and errors are those of `make_envs`."""
-    levels = {"num_levels": args.num_levels, "start_level": args.start_level, "obs_type": args.obs_type}
-    wrappers = ("frame_stack", "step_encoding", "observe_last_action", "spotlight_perturbation")
-    return make_envs(args.env_id, num_envs, **levels, **{name: getattr(args, name) for name in wrappers}, **kwargs)
+    names = ("num_levels", "start_level", "obs_type")
+    names += ("frame_stack", "step_encoding", "observe_last_action", "spotlight_perturbation")
+    kwargs |= {name: getattr(args, name) for name in names}
+    return make_envs(args.env_id, num_envs, options=parse_options(args.env_id, args.env_options), **kwargs)
 
 
 def make_agent(envs: gym.vector.VectorEnv, infos: dict, args: Args, device: torch.device) -> Agent:
@@ -1181,7 +1182,6 @@ def make_run(args: Args, step: int) -> Run:
     if torch.cuda.is_available() and args.cuda:
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
         torch.set_float32_matmul_precision("high")  # TF32
-    options = parse_options(args.env_id, args.env_options)
     if args.capture_video:
         check_can_film(args.env_id)
     with enough_memory(args, device):
@@ -1189,8 +1189,8 @@ def make_run(args: Args, step: int) -> Run:
         share = args.num_envs // processes
         # Environments that cannot be restored must not repeat the episodes that the run began with.
         seed = [args.seed, step] if step else args.seed
-        envs = environments(args, share, seed=seed, first_lane=rank * share, options=options, render_mode=mode)
-        obs, infos = envs.reset(options=options)
+        envs = environments(args, share, seed=seed, first_lane=rank * share, render_mode=mode)
+        obs, infos = envs.reset()
         agent = make_agent(envs, infos, args, device)
         rollout = Rollout.allocate(
             args.num_steps, obs, infos["ground_truth"] if args.ground_truth_coef else None, agent

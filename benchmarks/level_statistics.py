@@ -18,7 +18,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
 import memory_gym_envs  # noqa: F401 (registers the ids)
-from memory_gym_envs.character import FACINGS, PAD, free_controls, grid_controls, walk, wardrobe
+from memory_gym_envs.character import FACINGS, PAD, agent_tables, free_controls, grid_controls, walk
 from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.mystery_path import BEYOND, MAP_STRIDES, PIT, TILE_AT
 
@@ -55,7 +55,7 @@ def path_lengths(env_id: str, levels: int) -> np.ndarray:
 def fewest_steps(envs: gym.vector.VectorEnv) -> np.ndarray:
     """Return the fewest steps from where the agents are to their goals, (N,)."""
     s, grid = envs.state, envs.variant.grid
-    controls, table = grid_controls() if grid else free_controls(), wardrobe(envs.figures).walk
+    controls, table = grid_controls() if grid else free_controls(), agent_tables(envs.figures).walk
     fewest, steps = np.zeros(envs.num_envs, int), 0
     # Where free movement goes does not depend on the facing.
     front = np.zeros((envs.num_envs, FACINGS if grid else 1, SCREEN, SCREEN), bool)

@@ -13,7 +13,7 @@ from memory_gym_envs import FAMILIES, options_table
 HEAD = """# Reset options
 
 What `reset(options={...})` and `gym.make(id, options={...})` take, by environment. How long options hold is in
-[environments.md](environments.md#options). Of a list, marked *, one entry is drawn at every reset. Made by
+[environments.md](environments.md#options). Of a list, marked *, one entry is sampled at every reset. Made by
 `python benchmarks/options_page.py`.
 """
 

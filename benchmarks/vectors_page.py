@@ -22,6 +22,9 @@ What hides an agent, or a part of it, hides its entries. Behind the screen's edg
 may look the same: then all of them are 1, where usually one is. In a corner of the torus of Endless Mortar Mayhem, even
 several places may. Agents so large that they hide whole tiles hide their entries, too. Sizes that only options change
 are there as well, so that they mean the same under all options.
+
+In Searing Spotlights, what is seen below the bar is counted from every third pixel, so that a few visible pixels may
+count as none.
 """
 
 

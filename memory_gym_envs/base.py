@@ -37,7 +37,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         variant: the id, a key of the family's `variants`.
         num_envs: N, at least 1.
         render_mode: None, "rgb_array" (what the agent sees) or "debug_rgb_array" (larger, with the ground truth).
-        num_levels: with n > 0, every reset without a seed, automatic ones too, plays a level drawn from n; None or 0:
+        num_levels: with n > 0, every reset without a seed, automatic ones too, plays a level sampled from n; None or 0:
             no limit. A level is what `reset(seed=level)` builds.
         start_level: the first of those n levels.
         obs_type: "pixels" (the id's own observation space) or "vector": a flat (V,) float32 vector of what the frame
@@ -59,7 +59,8 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
     variants: ClassVar[Mapping[str, Any]] = {}
-    tables: ClassVar[tuple[str, ...]] = ("_wardrobe",)  # attributes that place_tables() makes, too large to pickle
+    tables: ClassVar[tuple[str, ...]] = ("_agent_tables",)  # attributes that place_tables() makes, too large to pickle
+    growing: ClassVar[tuple[str, ...]] = ()  # arrays of `state` that are widened along their last axis when needed
     kept = ("ready", "settings", "_rngs", "_level_rngs", "_seeds")  # besides the arrays of `state`
 
     def __init__(
@@ -78,9 +79,9 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             raise ValueError(f"render_mode must be None, {' or '.join(map(repr, RENDER_MODES))}, not {render_mode!r}")
         if obs_type not in OBS_TYPES:
             raise ValueError(f"obs_type must be {' or '.join(map(repr, OBS_TYPES))}, not {obs_type!r}")
-        self.num_envs = _integer("num_envs", num_envs, 1)
-        self.num_levels = _integer("num_levels", 0 if num_levels is None else num_levels, 0, NO_LIMIT)
-        self.start_level = _integer("start_level", start_level, 0)
+        self.num_envs = checked_integer("num_envs", num_envs, 1)
+        self.num_levels = checked_integer("num_levels", 0 if num_levels is None else num_levels, 0, NO_LIMIT)
+        self.start_level = checked_integer("start_level", start_level, 0)
         self.variant_id, self.variant, self.render_mode = variant, self.variants[variant], render_mode
         self.metadata = {**type(self).metadata, "render_fps": self.variant.render_fps}
         self.obs_type = obs_type
@@ -161,7 +162,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         Raises ValueError for a wrong seed or option; nothing has changed then.
         """
         lanes, options = self._split_mask(options)
-        seeds = self._lane_seeds(seed)
+        seeds = lane_seeds(seed, self.num_envs)
         self.restart(lanes, seeds, self.resolve(options))
         return self.observe(ALL), self._truth_info(lanes)
 
@@ -240,13 +241,25 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
 
         Raises ValueError for the state of another version of the environment; nothing has changed then.
         """
+        self._check_state(state)
         arrays, settings = restored(state["arrays"]), [self.resolve(each) for each in state["settings"]]
-        if arrays.keys() != vars(self.state).keys():
-            raise ValueError(f"the saved state is of another version of {self.variant_id}")
         super().set_state({**state, "settings": settings})
         self.configure(np.arange(self.num_envs))  # for what follows from the options of all lanes
         self.state = type(self.state)(**arrays)
         self.place_tables()
+
+    def _check_state(self, state: dict[str, Any]) -> None:
+        """Raises ValueError if the state has not what every lane needs."""
+        arrays = state["arrays"]
+        if arrays.keys() != vars(self.state).keys():
+            raise ValueError(f"the saved state is of another version of {self.variant_id}")
+        for name, ours in vars(self.state).items():
+            fixed, shape = slice(ours.ndim - (name in self.growing)), arrays[name].shape
+            if len(shape) != ours.ndim or shape[fixed] != ours.shape[fixed]:
+                raise ValueError(f"its array {name} has the shape {shape}, not {ours.shape}")
+        for name in ("settings", "_rngs", "_level_rngs", "_seeds"):
+            if len(state[name]) != self.num_envs:
+                raise ValueError(f"its {name} are of {len(state[name])} lanes, not of {self.num_envs}")
 
     def resolve(self, options: Mapping[str, Any] | None) -> dict[str, Any]:
         """The complete reset options. Raises ValueError for a wrong one."""
@@ -274,7 +287,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         if seed is not None and self.num_levels:
             stream = np.random.SeedSequence(seed, spawn_key=(LEVEL_STREAM,))
             self._level_rngs[lane] = np.random.Generator(np.random.PCG64(stream))
-        elif seed is None and self.num_levels:
+        elif self.num_levels:
             if self._level_rngs[lane] is None:
                 self._level_rngs[lane] = np.random.default_rng()
             seed = self.start_level + int(self._level_rngs[lane].integers(self.num_levels))
@@ -301,16 +314,6 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         if not self.ready and not mask.all():
             raise ValueError("reset_mask must hold every lane at the first reset")
         return np.flatnonzero(mask), {name: value for name, value in options.items() if name != "reset_mask"}
-
-    def _lane_seeds(self, seed: Any) -> list[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        if isinstance(seed, (list, tuple)) or (isinstance(seed, np.ndarray) and seed.ndim):
-            if len(seed) != self.num_envs:
-                raise ValueError(f"seed must hold one entry for each of {self.num_envs} lanes, not {len(seed)}")
-            return [None if each is None else _integer("seed", each, 0) for each in seed]
-        first = _integer("seed", seed, 0)
-        return [first + lane for lane in range(self.num_envs)]
 
     def _truth_info(self, lanes: np.ndarray | None) -> dict[str, np.ndarray]:
         """The info that every step and reset has; lanes: those that it is for, None for all."""
@@ -345,10 +348,12 @@ def numbered(every: list[Any]) -> tuple[tuple[Any, ...], list[int]]:
     return different, [different.index(each) for each in every]
 
 
-def widened(array: np.ndarray, width: int) -> np.ndarray:
-    """The same rows with room for at least `width` columns."""
-    missing = width - array.shape[1]
-    return array if missing <= 0 else np.pad(array, ((0, 0), (0, missing)))
+def widened(array: np.ndarray, width: int, filler: float = 0) -> np.ndarray:
+    """The same array with room for at least `width` along its last axis."""
+    missing = width - array.shape[-1]
+    if missing <= 0:
+        return array
+    return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, missing)], constant_values=filler)
 
 
 def _choices(space: gym.Space) -> int:
@@ -356,7 +361,23 @@ def _choices(space: gym.Space) -> int:
     return int(space.nvec[0]) if isinstance(space, gym.spaces.MultiDiscrete) else int(space.n)
 
 
-def _integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
+def lane_seeds(seed: Any, num_envs: int) -> list[int | None]:
+    """Each lane's seed, as Gymnasium's vector environments have it: of an integer, lane i has seed + i.
+
+    Raises ValueError for anything but None, an integer from 0, or one of these for each of the N lanes.
+    """
+    if seed is None:
+        return [None] * num_envs
+    if isinstance(seed, (list, tuple)) or (isinstance(seed, np.ndarray) and seed.ndim):
+        if len(seed) != num_envs:
+            raise ValueError(f"seed must hold one entry for each of {num_envs} lanes, not {len(seed)}")
+        return [None if each is None else checked_integer("seed", each, 0) for each in seed]
+    first = checked_integer("seed", seed, 0)
+    return [first + lane for lane in range(num_envs)]
+
+
+def checked_integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
+    """The value as an int; raises ValueError, which says what it must be, unless it is an integer in that range."""
     try:
         number = -1 if isinstance(value, (bool, np.bool_)) else operator.index(value)
     except TypeError:

@@ -17,7 +17,6 @@ ITEM = 12
 ITEMS = SCREEN // ITEM
 TILES = SCREEN // 12
 MASK = SCREEN * ITEMS  # items of a mask
-EVERY = (1 << ITEM) - 1  # all pixels of an item
 STEP = 2
 LINES = SCREEN // STEP  # words of a sample
 LINE = np.uint64((1 << 8 * ITEMS) - 1)  # all bits of one
@@ -39,7 +38,7 @@ class Stencils(NamedTuple):
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The pictures at these keys, (...), as 64-bit words: (..., words) uint64."""
-        return words(self.windows[self.column.take(x) + self.row.take(y)])
+        return as_words(self.windows[self.column.take(x) + self.row.take(y)])
 
 
 def stencils(shapes: Sequence[np.ndarray], height: int = SCREEN) -> Stencils:
@@ -109,7 +108,7 @@ def windows(tape: np.ndarray, height: int) -> np.ndarray:
     return np.ndarray((len(tape) - height + 1,), np.dtype(f"V{size * height}"), tape, 0, (size,))
 
 
-def words(views: np.ndarray) -> np.ndarray:
+def as_words(views: np.ndarray) -> np.ndarray:
     """Opaque items, (...), as 64-bit words (..., words) uint64."""
     return views.view(np.uint64).reshape(*views.shape, views.itemsize // 8)
 

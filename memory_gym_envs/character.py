@@ -128,7 +128,7 @@ def hand_places(scale: float, facing: int) -> list[tuple[int, int]]:
     return [(math.floor(centre + x) - centre, math.floor(centre + y) - centre) for x, y in turned]
 
 
-class Wardrobe(NamedTuple):
+class AgentTables(NamedTuple):
     """The tables of all figures in use, stacked: figure f walks by rows f * STRIDES and looks like rows f * FACINGS."""
 
     walk: np.ndarray  # (F * STRIDES * SPAN,)
@@ -136,7 +136,7 @@ class Wardrobe(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def wardrobe(figures: tuple[Figure, ...]) -> Wardrobe:
+def agent_tables(figures: tuple[Figure, ...]) -> AgentTables:
     """The tables of the given figures. Cached: environments with the same options share them."""
     walk = np.concatenate([walk_table(figure) for figure in figures])
     looks = [sprites(figure.scale) for figure in figures]
@@ -148,7 +148,7 @@ def wardrobe(figures: tuple[Figure, ...]) -> Wardrobe:
         images.append(np.pad(image, (*around, (0, 0))))
         solids.append(np.pad(solid, around))
     positions = np.arange(SPAN) - PAD
-    return Wardrobe(walk, make_sheet(np.concatenate(images), np.concatenate(solids), positions))
+    return AgentTables(walk, make_sheet(np.concatenate(images), np.concatenate(solids), positions))
 
 
 def walk(

@@ -65,10 +65,11 @@ def see(view: View) -> np.ndarray:
     _, kind = np.unique(prints, return_inverse=True)
     kind = kind.reshape(-1)
     facing, y, x = (index.reshape(-1) for index in np.indices(prints.shape))
-    alike, count = np.zeros((kind.max() + 1, FACINGS), bool), np.bincount(kind)
-    alike[kind, facing] = True
+    same_look, count = np.zeros((kind.max() + 1, FACINGS), bool), np.bincount(kind)
+    same_look[kind, facing] = True
     column, row = (np.rint(np.bincount(kind, place) / count) for place in (x, y))
-    size, facings = np.full_like(count, UNSEEN + radius_of(view.scale)), np.packbits(alike, axis=1, bitorder="little")
+    size = np.full_like(count, UNSEEN + radius_of(view.scale))
+    facings = np.packbits(same_look, axis=1, bitorder="little")
     codes = np.column_stack([size, column + view.columns.start, row + view.rows.start, facings]).astype(np.uint8)
     codes[kind[prints.reshape(-1) == 0]] = NOTHING
     table = np.full((FACINGS, SPAN, SPAN, len(NOTHING)), NOTHING, np.uint8)

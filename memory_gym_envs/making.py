@@ -24,7 +24,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrap
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from gymnasium.wrappers.vector import RecordEpisodeStatistics, RecordVideo, TransformAction
 
-from memory_gym_envs.base import MemoryGymVectorEnv
+from memory_gym_envs.base import MemoryGymVectorEnv, checked_integer
 from memory_gym_envs.options import brief
 from memory_gym_envs.saving import Saved
 from memory_gym_envs.wrappers import (
@@ -58,14 +58,14 @@ def make_envs(
     spotlight_perturbation: bool = False,
     render_mode: str | None = None,
 ) -> VectorEnv:
-    """Make a vector environment of N lanes with same-step autoreset; the caller's `reset(options=options)` begins.
+    """Make a vector environment of N lanes with same-step autoreset; the caller's `reset()` begins.
 
     env_id: a Gymnasium id, or "module:id" if importing a module registers it.
     seed: of all lanes, an integer or several from 0; the lanes get streams of their own, and the next reset needs none.
     first_lane: the lanes are number first_lane, first_lane + 1, ... of a larger set: with the same seed, they have the
         seeds and play the episodes of these lanes of it. Vector environments of other packages may seed all lanes
         together, and then do not.
-    options: see `parse_options`.
+    options: reset parameters of a Memory Gym environment, the defaults of every reset; see `parse_options`.
     num_levels, start_level, obs_type: of Memory Gym environments; others have no such thing and ignore them, with a
         line on stderr where pictures are shown though vectors were asked for.
     frame_stack, step_encoding, observe_last_action, spotlight_perturbation: see GrayscaleStack and VectorStack,
@@ -79,10 +79,12 @@ def make_envs(
     Raises gymnasium.error.Error for an unknown id, ImportError for a missing package, ValueError for an environment
     that cannot be made or that is not supported, and for wrong arguments.
     """
-    if first_lane < 0:
-        raise ValueError(f"first_lane must be an integer of at least 0, not {first_lane}")
+    for name, value, low in (("num_envs", num_envs, 1), ("first_lane", first_lane, 0)):
+        checked_integer(name, value, low)
     spec, memory_gym = find_spec(env_id), is_memory_gym(env_id)
-    levels = {"num_levels": num_levels, "start_level": start_level, "obs_type": obs_type}
+    if options and not memory_gym:
+        raise ValueError(f"options are reset parameters of Memory Gym environments; {env_id} has none")
+    levels = {"num_levels": num_levels, "start_level": start_level, "obs_type": obs_type, "options": options}
     kwargs = levels if memory_gym else {}
     if render_mode is not None:
         kwargs["render_mode"] = render_mode if memory_gym else "rgb_array"
@@ -109,7 +111,7 @@ def make_envs(
         with one_line_errors(f"{env_id} cannot be reset"):
             # Neighbouring seeds must not share lanes, so the lanes' seeds count up from a hash of the seed.
             first_seed = int(np.random.SeedSequence(seed).generate_state(1)[0]) + first_lane
-            envs.reset(seed=first_seed, options=options)
+            envs.reset(seed=first_seed)
     locate_errors(envs.unwrapped, first_lane, first_seed)  # only now, since the errors above have their own words
     # An explicit seed is a level of its own, which nobody plays: what counts episodes comes after it.
     return EpisodeStatistics(envs)
@@ -143,7 +145,8 @@ def load_state(envs: VectorEnv, state: dict[str, Any]) -> None:
     No reset is needed before or after. The state remains the caller's: later steps do not change it.
 
     Raises ValueError if the state is of other environments: of another id, number of lanes, choice of levels or kind of
-    observation, or with other wrappers; and for what is no state. Nothing has changed then.
+    observation, or with other wrappers; and for what is no state. Nothing has changed then, but a video that was
+    being recorded ends.
     """
     parts = saved_parts(envs)
     if parts is None:
@@ -156,8 +159,18 @@ def load_state(envs: VectorEnv, state: dict[str, Any]) -> None:
             raise ValueError(
                 f"the saved state is of environments with {name} {theirs.get(name)!r}, not {ours.get(name)!r}"
             )
-    for part, each in zip(parts, state["parts"], strict=True):
-        part.set_state(each)
+    before = [part.get_state() for part in parts]
+    try:
+        set_states(parts, state["parts"])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:  # it is not what get_state() returned
+        set_states(parts, before)
+        raise ValueError(f"this is no state of {envs.spec.id}: {one_line(error)}") from error
+
+
+def set_states(parts: list[Saved], states: list[dict[str, Any]]) -> None:
+    """Set each part to its state."""
+    for part, state in zip(parts, states, strict=True):
+        part.set_state(state)
 
 
 def saved_parts(envs: VectorEnv) -> list[Saved] | None:
@@ -198,6 +211,8 @@ def find_spec(env_id: str) -> EnvSpec:
     Raises ImportError for a module that is not installed, gymnasium.error.Error for an id that is not registered.
     """
     module, _, name = env_id.rpartition(":")
+    if module.startswith("."):
+        raise ImportError(f"the module of {env_id} begins with a dot; give its whole name")
     if module:
         importlib.import_module(module)
     if name not in gym.registry and (near := difflib.get_close_matches(name, gym.registry, n=1)):

@@ -18,12 +18,12 @@ from memory_gym_envs.character import (
     SPAN,
     STRIDES,
     Figure,
+    agent_tables,
     free_controls,
     grid_controls,
     radius_of,
     sprites,
     walk,
-    wardrobe,
 )
 from memory_gym_envs.drawing import ROW, SCREEN, Sheet, paste, ring, turned_45
 from memory_gym_envs.entries import Entries, vector_slices
@@ -180,8 +180,8 @@ class Level(NamedTuple):
     fuse: int
 
 
-def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
-    """Draws a level in the original's order, so that its seeds mean the same here."""
+def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
+    """Samples a level in the original's order, so that its seeds mean the same here."""
     word = words(rng)
     size = TORUS_SIZE if variant.endless else values["arena_size"]
     tile = below(word, size * size)
@@ -190,14 +190,14 @@ def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Varian
         kinds = values["allowed_commands"]
         commands = [below(word, kinds) for _ in range(values["initial_command_count"])]
     else:
-        commands = draw_walk(word, tile, pick(word, values["command_count"]), size, values["allowed_commands"])
+        commands = sample_walk(word, tile, pick(word, values["command_count"]), size, values["allowed_commands"])
     show = pick(word, values["command_show_duration"]) if variant.clue else 0
     gap = pick(word, values["command_show_delay"]) if variant.clue else 0
     burn = pick(word, values["explosion_duration"])
     return Level(tile, offset, commands, show, gap, burn, pick(word, values["explosion_delay"]))
 
 
-def draw_walk(word: Callable[[], int], tile: int, count: int, size: int, kinds: int) -> list[int]:
+def sample_walk(word: Callable[[], int], tile: int, count: int, size: int, kinds: int) -> list[int]:
     """Commands that lead from the tile through the arena without leaving it."""
     steps = _valid_commands(size, kinds)
     commands = []
@@ -474,7 +474,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         episode takes 58 to 274 steps (table 4.4), Grid 46 to 118, B 19 to 235, B-Grid 7 to 79. The B bounds are one
         above the thesis' formula (18 to 234, 6 to 78), because the first command has explosion_delay + 1 steps;
         behind a clue that step is made up for: the reset already shows the clue's first step.
-    Options: `VARIANTS[id].options`. Those marked * are lists, one entry of which is drawn at every reset.
+    Options: `VARIANTS[id].options`. Those marked * are lists, one entry of which is sampled at every reset.
     Ground truth: (2,) the target tile's column and row, divided by arena size - 1.
     Final info: `reward`, `length`, `commands_completed` and `success` (in the endless id `max_command_sequence`, the
         length of the longest completed sequence). commands_completed is a share of the sequence, in the endless id a
@@ -492,6 +492,7 @@ class MortarMayhem(MemoryGymVectorEnv):
     """
 
     variants = VARIANTS
+    growing = ("commands", "clue")
     tables = (*MemoryGymVectorEnv.tables, "_looks")
     kept = (*MemoryGymVectorEnv.kept, "_clues_open")
 
@@ -539,7 +540,7 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     def place_tables(self) -> None:
         """The flat tables that step() looks things up in, and where each lane's rows start in them."""
-        self._wardrobe = wardrobe(self.figures)
+        self._agent_tables = agent_tables(self.figures)
         self._controls = grid_controls() if self.variant.grid else free_controls()
         self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
         self._lane_clue = np.arange(self.num_envs) * self.state.clue.shape[1]  # (N,)
@@ -552,9 +553,9 @@ class MortarMayhem(MemoryGymVectorEnv):
             self._large = any(2 * figure.reach > TILE for figure in self.figures)
 
     def begin(self, lanes: np.ndarray) -> None:
-        """Draws the lanes' next levels and starts their episodes."""
+        """Samples the lanes' next levels and starts their episodes."""
         for lane in lanes.tolist():
-            level = draw_level(self._rngs[lane], self.settings[lane], self.variant)
+            level = sample_level(self._rngs[lane], self.settings[lane], self.variant)
             write_level(self.state, lane, level, self.variant)
         self._clues_open = self.variant.clue
 
@@ -593,7 +594,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         action = actions if self.variant.grid else actions[:, 0] * 3 + actions[:, 1]  # (N,)
         if acting is not EVERY_LANE:
             action = np.where(acting, action, self._controls.actions - 1)
-        s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._wardrobe.walk)
+        s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._agent_tables.walk)
 
     def _change_tiles(self, lanes: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
         """Lights the lanes' tiles and checks their command, or puts the tiles out."""
@@ -653,7 +654,7 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3)."""
-        return draw(self.state, self._wardrobe.sheet, lanes)
+        return draw(self.state, self._agent_tables.sheet, lanes)
 
     def ground_truth(self) -> np.ndarray:
         """A fresh (N, 2): the target's column and row, divided by arena size - 1."""

@@ -18,12 +18,12 @@ from memory_gym_envs.character import (
     SPAN,
     STRIDES,
     Figure,
+    agent_tables,
     free_controls,
     grid_controls,
     radius_of,
     sprites,
     walk,
-    wardrobe,
 )
 from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, magnify, make_sheet, paste, stamp
 from memory_gym_envs.entries import Entries, vector_slices
@@ -88,10 +88,10 @@ def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
         (endless, Option("show_stamina", False, "bool", None, None, "show how much stamina is left")),
         (True, Option("visual_feedback", True, "bool", None, None, "show a red cross where the agent falls off")),
         (endless, Option("camera_offset_scale", 5.0, "float", 0.0, 5.5, camera)),
-        (endless, Option("stamina_level", 20, "int", 1, None, "steps to reach the next tile in")),
+        (endless, Option("stamina_level", 20, "int", 1, None, "steps until the agent must have reached a new tile")),
         (not endless, Option("reward_goal", 1.0, "float", None, None, "reward for reaching the goal")),
         (True, Option("reward_fall_off", 0.0, "float", None, None, "reward for falling off the path")),
-        (True, Option("reward_path_progress", progress, "float", None, None, "reward for each tile reached first")),
+        (True, Option("reward_path_progress", progress, "float", None, None, "reward for each new tile of the path")),
         (True, Option("reward_step", 0.0, "float", None, None, "reward for every step")),
     ]
     return tuple(option for present, option in rows if present)
@@ -114,7 +114,7 @@ def _entries(endless: bool) -> tuple[Entries, ...]:
         *agent_entries(-PAD, SPAN - 1 - PAD),
         cross,
         Entries("past", SEGMENT * SIDE, past),
-        Entries("scroll", 1, "how far right of its column's left edge each of them starts, / 12 pixels"),
+        Entries("scroll", 1, "how far right of its column's left edge each of them starts, at most, / 12 pixels"),
         Entries("ground", 1, "one more than how far left the background has moved, / 12 pixels; 0: there is none"),
         Entries("bar", 1, "1: the stamina bar is there"),
         Entries("stamina", 1, "how much of it is green"),
@@ -192,12 +192,15 @@ class State:
     reward_step: np.ndarray  # (N,) float64
 
 
+PATH_ARRAYS = ("cell", "heading_at", "reached")  # (N, P)
+MAP_ARRAYS = ("step_at", "known", "walls")  # (N, M)
+
+
 def empty_state(lanes: int, segments: int) -> State:
     """The state of N lanes before their first reset, with room for this many segments."""
     steps, cells = (SIDE * SIDE + 1,), (segments * SEGMENT * ROWS,)
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("pos", "origin", "tile"), (2,))
-    shapes |= {"speed": (1,), "step_at": cells, "known": cells, "walls": cells}
-    shapes |= dict.fromkeys(("cell", "heading_at", "reached"), steps)
+    shapes |= {"speed": (1,)} | dict.fromkeys(PATH_ARRAYS, steps) | dict.fromkeys(MAP_ARRAYS, cells)
     flags = ("fallen", "past", "hurt", "cross_fits", "known", "walls", "extras", "feedback")
     kinds: dict[str, Any] = dict.fromkeys((*flags, *(f"show_{what}" for what in SHOWN)), bool)
     kinds |= dict.fromkeys(("returned", "camera"), np.float64)
@@ -225,16 +228,16 @@ def make_room(s: State, steps: int, segments: int) -> bool:
         return False
     # By half as much again at least, so that an ever longer path seldom has to move.
     steps, segments = max(steps + 1, s.cell.shape[1] * 3 // 2), max(segments, room * 3 // 2)
-    for name in ("cell", "heading_at", "reached"):
+    for name in PATH_ARRAYS:
         setattr(s, name, widened(getattr(s, name), steps))
-    for name in ("step_at", "known", "walls"):
+    for name in MAP_ARRAYS:
         setattr(s, name, widened(getattr(s, name), segments * SEGMENT * ROWS))
     return True
 
 
 # ---- levels ----
 
-# While a path is drawn, a place is column * SIDE + row of a 7 x 7 grid.
+# While a path is sampled, a place is column * SIDE + row of a 7 x 7 grid.
 PLACES = [divmod(place, SIDE) for place in range(SIDE * SIDE)]
 CELLS = [column * ROWS + BEYOND + row for column, row in PLACES]
 STRAIGHT = ((1, 0), (-1, 0), (0, 1), (0, -1))  # in the original's order
@@ -281,11 +284,11 @@ def read_ahead(rng: np.random.Generator, paths: int) -> Tape:
     return Tape(rng, paths * (DRAWS + SPARE))
 
 
-def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
-    """Draws a level in the original's order, so that its seeds mean the same here."""
+def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
+    """Samples a level in the original's order, so that its seeds mean the same here."""
     tape = read_ahead(rng, FIRST_SEGMENTS if variant.endless else 1)
     if variant.endless:
-        level = draw_segments(tape, below(tape, SIDE), 0, FIRST_SEGMENTS)
+        level = sample_segments(tape, below(tape, SIDE), 0, FIRST_SEGMENTS)
     else:
         side = pick(tape, values["cardinal_origin_choice"])
         start, end = below(tape, SIDE), below(tape, SIDE)
@@ -294,26 +297,26 @@ def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Varian
             start, end = near * SIDE + start, far * SIDE + end
         else:
             start, end = start * SIDE + near, end * SIDE + far
-        walls = draw_walls(tape, start, end)
-        level = Level(cells_of(draw_path(tape, walls, start, end), 0), [walls])
+        walls = sample_walls(tape, start, end)
+        level = Level(cells_of(sample_path(tape, walls, start, end), 0), [walls])
     tape.close()
     return level
 
 
-def draw_segments(tape: Tape, row: int, first: int, count: int) -> Level:
-    """Draws segments of an endless path, from this row on, the first of them being segment number `first`."""
+def sample_segments(tape: Tape, row: int, first: int, count: int) -> Level:
+    """Samples segments of an endless path, from this row on, the first of them being segment number `first`."""
     path, every_wall = [], []
     for segment in range(first, first + count):
         start, end = row, (SIDE - 1) * SIDE + below(tape, SIDE)
-        walls = draw_walls(tape, start, end)
-        path += cells_of(draw_path(tape, walls, start, end), segment)
+        walls = sample_walls(tape, start, end)
+        path += cells_of(sample_path(tape, walls, start, end), segment)
         path.append(path[-1] + ROWS)  # the transition tile
         every_wall.append(walls)
         row = end % SIDE
     return Level(path, every_wall)
 
 
-def draw_walls(tape: Tape, start: int, end: int) -> list[int]:
+def sample_walls(tape: Tape, start: int, end: int) -> list[int]:
     """Untraceable places: some inside, some on the border that touch neither those nor start and end.
 
     So there always is a path: along the border, and one ring further inside past the walls that stand there.
@@ -325,7 +328,7 @@ def draw_walls(tape: Tape, start: int, end: int) -> list[int]:
     return walls + tape.picks(free, (4, 8)[below(tape, 2)])
 
 
-def draw_path(tape: Tape, walls: list[int], start: int, end: int) -> list[int]:
+def sample_path(tape: Tape, walls: list[int], start: int, end: int) -> list[int]:
     """The path that A* finds over random costs, not always the cheapest: its places from start to end."""
     costs, used, distance = tape.eighths, tape.used, DISTANCES[end]
     cost, total, previous = [UNREACHED] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
@@ -344,8 +347,8 @@ def draw_path(tape: Tape, walls: list[int], start: int, end: int) -> list[int]:
                 elif there < cost[place]:
                     # The original leaves the higher cost as it is.
                     previous[place] = here
-        # Next is not the least total, but as in the original the first in line that is less than that of the very
-        # first, else the very first. So no one needs to be compared with it twice.
+        # Next is not the least total: as in the original, it is the first in line whose total is less than that of the
+        # first one, else the first one. So none needs to be compared with it twice.
         if first is None:
             waiting, passed = iter(opened), []
             first = next(waiting)
@@ -642,10 +645,15 @@ def show_trail(out: np.ndarray, s: State, lanes: np.ndarray | slice, looks: Look
         # The background has the same corners, but not the pixels inside them.
         inset, width = s.show_ground[lanes][owner], (SCREEN - BAR * s.show_stamina[lanes])[owner]  # (m,)
     shown = (x + inset < width) & (x + (TILE - 1) - inset >= 0)
+    cut = x == 1 - TILE  # all but its last pixels, in the screen's first column
+    if np.count_nonzero(cut):
+        # A camera between two pixels may put the next tile, which covers them, there too.
+        row = owner * SCREEN + y  # (m,)
+        shown &= ~(cut & np.isin(row, row[x == 0]))
     if agent is not None:
         corners = np.stack([x, y], axis=1)[:, None] + abs(CORNERS * (TILE - 1) - np.reshape(inset, (-1, 1, 1)))
         free = (corners[..., 0] >= 0) & (corners[..., 0] < np.reshape(width, (-1, 1)))  # (m, 4)
-        shown = (free & ~covered(looks, *(each[owner] for each in agent), corners + PAD)).any(axis=1)
+        shown &= (free & ~covered(looks, *(each[owner] for each in agent), corners + PAD)).any(axis=1)
     owner, x, y = owner[shown], x[shown], y[shown]
     out[owner, (x // TILE + 1) * SIDE + y // TILE] = 1.0
     # Not all of a path's tiles have the same, where the camera is between two pixels.
@@ -753,7 +761,7 @@ class MysteryPath(MemoryGymVectorEnv):
         (20) steps (all tiles are new again after a fall), by falling off in a column left of the best progress, and by
         falling off at the same place again. Truncated after `max_steps` steps (512, Grid 128, endless no limit; a real
         end at that very step counts as termination).
-    Options: `VARIANTS[id].options`. Those marked * are lists, one entry of which is drawn at every reset.
+    Options: `VARIANTS[id].options`. Those marked * are lists, one entry of which is sampled at every reset.
     Ground truth: one-hot, the direction of the path's next tile from where the agent last was on the path: east, north,
         south, west, (4,); at the goal, the direction that leads to it. Endless id: east, north, south, (3,); where the
         path goes west, the direction before.
@@ -772,6 +780,7 @@ class MysteryPath(MemoryGymVectorEnv):
 
     variants = VARIANTS
     tables = (*MemoryGymVectorEnv.tables, "_looks")
+    growing = (*PATH_ARRAYS, *MAP_ARRAYS, "trail_lane", "trail_x", "trail_y")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
         """The observation space of one lane with pixels, and its action space."""
@@ -830,7 +839,7 @@ class MysteryPath(MemoryGymVectorEnv):
 
     def place_tables(self) -> None:
         """The flat tables that step() looks things up in, and where each lane's rows start in them."""
-        self._wardrobe = wardrobe(self.figures)
+        self._agent_tables = agent_tables(self.figures)
         self._controls = grid_controls() if self.variant.grid else free_controls()
         self._truths = np.eye(4)[:, : 3 if self.variant.endless else 4].copy()
         self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
@@ -843,10 +852,10 @@ class MysteryPath(MemoryGymVectorEnv):
             self._large = any(2 * radius_of(scene.scale) > TILE for scene in self.scenes)
 
     def begin(self, lanes: np.ndarray) -> None:
-        """Draws the lanes' next levels and starts their episodes."""
+        """Samples the lanes' next levels and starts their episodes."""
         forget_trails(self.state, lanes)
         for lane in lanes.tolist():
-            level = draw_level(self._rngs[lane], self.settings[lane], self.variant)
+            level = sample_level(self._rngs[lane], self.settings[lane], self.variant)
             if make_room(self.state, len(level.path), len(level.walls)):
                 self.place_tables()
             write_level(self.state, lane, level, self.variant.endless)
@@ -900,7 +909,7 @@ class MysteryPath(MemoryGymVectorEnv):
             s.facing = ENDLESS_TURN.take(s.facing * len(ENDLESS_MOVES) + action)
             s.pos = s.pos + ENDLESS_MOVES.take(action, axis=0) * s.speed
         else:
-            s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._wardrobe.walk)
+            s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._agent_tables.walk)
 
     def _lengthen(self) -> None:
         """Appends a segment to the paths whose last one was just entered."""
@@ -912,7 +921,7 @@ class MysteryPath(MemoryGymVectorEnv):
             steps, segments = int(s.count[lane]), int(s.segments[lane])
             row = int(s.cell[lane, steps]) % ROWS - BEYOND
             tape = read_ahead(self._rngs[lane], 1)
-            level = draw_segments(tape, row, segments, 1)
+            level = sample_segments(tape, row, segments, 1)
             tape.close()
             if make_room(s, steps + len(level.path), segments + 1):
                 self.place_tables()
@@ -949,7 +958,7 @@ class MysteryPath(MemoryGymVectorEnv):
 
     def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3)."""
-        return draw(self.state, self._wardrobe.sheet, lanes, self.variant.endless)
+        return draw(self.state, self._agent_tables.sheet, lanes, self.variant.endless)
 
     def ground_truth(self) -> np.ndarray:
         """A fresh (N, 4), endless (N, 3): the direction of the path's next tile."""
@@ -981,5 +990,5 @@ class MysteryPath(MemoryGymVectorEnv):
             centre = tile_centres(np.array([cell])) - (camera, 0)
             if PAD - TILE // 2 < centre[0, 0] < PAD + SCREEN + TILE // 2:
                 paste(small, tiles(), np.array([kind]), centre)
-        draw_agent(small, s, self._wardrobe.sheet, one, endless)
+        draw_agent(small, s, self._agent_tables.sheet, one, endless)
         frame[:] = magnify(small.reshape(SCREEN, SCREEN, 3), DEBUG_ZOOM)

@@ -22,7 +22,7 @@ LARGEST = 10**9  # sums of numbers up to that stay exact enough for rewards, and
 class Option:
     """One reset parameter.
 
-    kind: "bool", "int", "float" or "ints" (a list of integers, one of which is drawn at every reset).
+    kind: "bool", "int", "float" or "ints" (a list of integers, one of which is sampled at every reset).
     low, high: the allowed range, both ends included; None: as far as LARGEST on that side.
     also: single values allowed besides the range.
     empty: whether a list may have no entries.

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import ALL, DEBUG_ZOOM, MemoryGymVectorEnv
+from memory_gym_envs.base import ALL, DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, widened
 from memory_gym_envs.bits import (
     ITEMS,
     LINE,
@@ -37,12 +37,12 @@ from memory_gym_envs.character import (
     SPAN,
     STRIDES,
     Figure,
+    agent_tables,
     free_controls,
     hand_places,
     radius_of,
     sprites,
     walk,
-    wardrobe,
 )
 from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, disk, magnify, make_sheet, paste, ring
 from memory_gym_envs.entries import Entries, vector_slices
@@ -70,8 +70,6 @@ START, TOWARD, BEND = slice(5, 7), slice(7, 9), slice(9, 11)
 NO_SPOT = np.array([0.0, 0.0, 0.0, -1.0, -1.0, AWAY, AWAY, 0.0, 0.0, 0.0, 0.0])  # (11,)
 
 NO_KEY = -AWAY  # brings a spotlight that does not exist to place 0
-
-NO_LIMIT = np.iinfo(np.int64).max
 
 
 # ---- configuration ----
@@ -104,8 +102,8 @@ def _light_rows(endless: bool) -> list[tuple[bool, Option]]:
         (endless, Option("steps_per_coin", 160, "int", 1, None, deadline, also=(-1,))),
         (True, Option("initial_spawns", 3 if endless else 4, "int", 0, 100, "spotlights at the start")),
         (finite, Option("num_spawns", 30, "int", 0, None, "spotlights that follow")),
-        (finite, Option("initial_spawn_interval", 30, "int", 0, None, "steps between them, but for the next")),
-        (finite, Option("spawn_interval_threshold", 10, "int", 0, None, "steps added to those")),
+        (finite, Option("initial_spawn_interval", 30, "int", 0, None, "steps between them, without the threshold")),
+        (finite, Option("spawn_interval_threshold", 10, "int", 0, None, "steps added to initial_spawn_interval")),
         (finite, Option("spawn_interval_decay", 0.95, "float", 0.0, 1.0, UNUSED)),
         (endless, Option("spawn_interval", 50, "int", 1, None, "steps between the spotlights that follow")),
         (True, Option("spot_min_radius", 7.5, "float", small, large, "smallest radius of a spotlight, rounded down")),
@@ -117,17 +115,17 @@ def _light_rows(endless: bool) -> list[tuple[bool, Option]]:
         (True, Option("black_background", False, "bool", None, None, "black floor; spotlights have a white rim")),
         (True, Option("hide_chessboard", False, "bool", None, None, "white floor, which never reddens")),
         (True, Option("light_dim_off_duration", 6, "int", 0, 255, "steps in which the light goes out; 0: it is out")),
-        (True, Option("light_threshold", 255, "int", 0, 255, "darkness that dimming goes on until; 255: black")),
+        (True, Option("light_threshold", 255, "int", 0, 255, "dimming ends when darkness exceeds this; 255: black")),
     ]
 
 
 def _body_rows(endless: bool) -> list[tuple[bool, Option]]:
     """Coins, exit, agent and rewards, likewise."""
-    finite = not endless
+    finite, shown = not endless, "frames that show the first coin in the dark; each later one: one frame less"
     return [
         (finite, Option("num_coins", (1,), "ints", 0, MOST_COINS, "coins to collect *", empty=True)),
         (True, Option("coin_scale", 0.375, "float", 0.1, 2.0, "size of a coin; 0.375: 6 pixels wide")),
-        (endless, Option("coin_show_duration", 6, "int", 0, None, "steps that a new coin is visible in the dark")),
+        (endless, Option("coin_show_duration", 6, "int", 0, None, shown)),
         (True, Option("coins_visible", False, "bool", None, None, "coins are visible in the dark")),
         (endless, Option("coin_enabled", True, "bool", None, None, "false: no coins, and no time limit for them")),
         (finite, Option("use_exit", True, "bool", None, None, "false: the last coin ends the episode")),
@@ -152,7 +150,7 @@ def _body_rows(endless: bool) -> list[tuple[bool, Option]]:
 def _entries(endless: bool) -> tuple[Entries, ...]:
     """What the vector of an id holds."""
     action = "the action in the bar, one-hot: none, {}, {}; zeros where it is hidden"
-    place = "{}: pixels that are visible, over 144 and at most 1; x and y of their middle, over 84"
+    place = "{}: how many pixels are visible, over 144 and at most 1; x and y of their middle, over 84"
     tiles = "of each tile of 12 x 12 pixels, row by row, the share that is {}; the bar's pixels don't count"
     table = [
         (True, "health", 1, "share of the bar's left half that is green"),
@@ -200,9 +198,9 @@ class State:
     coin_age: np.ndarray  # (N,) steps since the coin appeared (endless)
     success: np.ndarray  # (N,) 1 when the task is done
     spots: np.ndarray  # (11, N, S) float64: the spotlights, oldest first; see TIME .. BEND
-    spot_key: np.ndarray  # (N, S) where the radius begins in the lamps' tables, with PLACE_0 added; or NO_KEY
+    spot_key: np.ndarray  # (N, S) where the radius begins in SpotStencils, with PLACE_0 added; or NO_KEY
     count: np.ndarray  # (N,) spotlights
-    place: np.ndarray  # (2, N, S) where each one shines, x and y as indices of the lamps' tables; 0 where it doesn't
+    place: np.ndarray  # (2, N, S) where each one shines, x and y as indices of SpotStencils; 0 where it doesn't
     seen: np.ndarray  # (N,) bool: some of the agent may be in the light
     wait: np.ndarray  # (N,) steps until the next one
     spawns: np.ndarray  # (N,) spotlights to follow
@@ -256,14 +254,6 @@ def empty_state(lanes: int) -> State:
     return State(**{name: np.zeros(shapes.get(name, (lanes,)), kinds.get(name, np.int64)) for name in names})
 
 
-def widened(array: np.ndarray, width: int, filler: float = 0) -> np.ndarray:
-    """The same array with room for at least `width` along its last axis."""
-    missing = width - array.shape[-1]
-    if missing <= 0:
-        return array
-    return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, missing)], constant_values=filler)
-
-
 def make_room(s: State, coins: int = 0, spots: int = 0) -> None:
     """Widens the state's arrays, where they are too narrow, for so many coins and spotlights in a lane."""
     s.bodies, s.touch = widened(s.bodies, COIN + coins, GONE), widened(s.touch, COIN + coins)
@@ -287,27 +277,27 @@ class Level(NamedTuple):
     exit: tuple[int, int] | None
 
 
-def draw_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
-    """Draws a level in the original's order, so that its seeds mean the same here."""
+def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
+    """Samples a level in the original's order, so that its seeds mean the same here."""
     word = words(rng)
     facing = below(word, FACINGS)
     if values["sample_agent_position"]:
-        pos, free = draw_place(word, None, AGENT_SPACE)
+        pos, free = sample_place(word, None, AGENT_SPACE)
     else:
         pos = (MIDDLE, MIDDLE)
         free = occupied(None, pos, COIN_SPACE)
-    spots = [draw_spot(rng, values) for _ in range(values["initial_spawns"])]
+    spots = [sample_spot(rng, values) for _ in range(values["initial_spawns"])]
     if variant.endless:
-        return Level(facing, pos, spots, [draw_coin(word, None)] if values["coin_enabled"] else [], None)
+        return Level(facing, pos, spots, [sample_coin(word, None)] if values["coin_enabled"] else [], None)
     things = []
     coins = pick(word, values["num_coins"]) if values["num_coins"] else 0
     for _ in range(coins + values["use_exit"]):
-        place, free = draw_place(word, free, COIN_SPACE)
+        place, free = sample_place(word, free, COIN_SPACE)
         things.append(inside(place))
     return Level(facing, pos, spots, things, things.pop() if values["use_exit"] else None)
 
 
-def draw_place(word: Callable[[], int], free: np.ndarray | None, space: int) -> tuple[tuple[int, int], np.ndarray]:
+def sample_place(word: Callable[[], int], free: np.ndarray | None, space: int) -> tuple[tuple[int, int], np.ndarray]:
     """A place near a free pixel, and what is free when the pixels around that one are occupied.
 
     free: (84, 84) bool, or None: every pixel is.
@@ -339,13 +329,13 @@ def inside(pos: tuple[int, int]) -> tuple[int, int]:
     return x, y
 
 
-def draw_coin(word: Callable[[], int], last: tuple[int, int] | None) -> tuple[int, int]:
+def sample_coin(word: Callable[[], int], last: tuple[int, int] | None) -> tuple[int, int]:
     """The endless task's next coin, away from the last one. It may lie under the agent, as in the original."""
     free = None if last is None else occupied(None, last, AGENT_SPACE)
-    return inside(draw_place(word, free, AGENT_SPACE)[0])
+    return inside(sample_place(word, free, AGENT_SPACE)[0])
 
 
-def draw_spot(rng: np.random.Generator, values: dict[str, Any]) -> list[float]:
+def sample_spot(rng: np.random.Generator, values: dict[str, Any]) -> list[float]:
     """A new spotlight, a column of State.spots: on a bent path from one side of the screen to roughly the other."""
     word = words(rng)
     least, slowest = int(values["spot_min_radius"]), values["spot_min_speed"]
@@ -480,7 +470,7 @@ def bars(endless: bool) -> np.ndarray:
     return table
 
 
-class Lamps(NamedTuple):
+class SpotStencils(NamedTuple):
     """Every spotlight at every place, by its radius."""
 
     disks: Stencils
@@ -488,10 +478,10 @@ class Lamps(NamedTuple):
 
 
 @lru_cache(maxsize=8)
-def lamps(least: int, largest: int) -> Lamps:
+def spot_stencils(least: int, largest: int) -> SpotStencils:
     """The tables for spotlights of these radii. Cached: environments with the same options share them."""
     disks, rims = spot_shapes(least, largest)
-    return Lamps(stencils(disks), stencils(rims))
+    return SpotStencils(stencils(disks), stencils(rims))
 
 
 def spot_shapes(least: int, largest: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -556,31 +546,31 @@ def _arch(size: int, corner: int) -> np.ndarray:
     return mask
 
 
-class Art(NamedTuple):
+class DrawingTables(NamedTuple):
     """The tables that pictures are made of."""
 
-    lamps: Lamps
+    spots: SpotStencils
     figures: Sheet
     props: Sheet
     bars: np.ndarray
     scratch: np.ndarray  # (N, 588) scratch for pixels()
 
 
-def draw(s: State, art: Art, lanes: np.ndarray | slice) -> np.ndarray:
+def draw(s: State, drawing: DrawingTables, lanes: np.ndarray | slice) -> np.ndarray:
     """Fresh frames of the lanes, (n, 84, 84, 3) uint8, from the state alone."""
     dim = (s.length < s.dark_at)[lanes]  # (n,) the darkness is not just black
-    frames = scene(s, art, lanes, s.seen[lanes] | dim)
-    lit, rim = shine(s, art.lamps, lanes)
-    darken(s, lanes, frames, pixels(lit, art.scratch[: len(lit)]), rim, np.flatnonzero(dim))
+    frames = scene(s, drawing, lanes, s.seen[lanes] | dim)
+    lit, rim = shine(s, drawing.spots, lanes)
+    darken(s, lanes, frames, pixels(lit, drawing.scratch[: len(lit)]), rim, np.flatnonzero(dim))
     coins = s.coin_age[lanes] < s.coin_show[lanes]
     if np.count_nonzero(coins):
-        put_coins(s, art, lanes, frames, coins)
+        put_coins(s, drawing, lanes, frames, coins)
     layered = np.count_nonzero(s.layered[lanes])
     if layered:
-        put_layer(s, art, lanes, frames, BELOW_BAR)
-    frames.reshape(-1, SCREEN, ROW)[:, :BAR] = art.bars.take(bar_rows(s, lanes), axis=0)[:, None]
+        put_layer(s, drawing, lanes, frames, BELOW_BAR)
+    frames.reshape(-1, SCREEN, ROW)[:, :BAR] = drawing.bars.take(bar_rows(s, lanes), axis=0)[:, None]
     if layered:
-        put_layer(s, art, lanes, frames, ABOVE_BAR)
+        put_layer(s, drawing, lanes, frames, ABOVE_BAR)
     return frames.reshape(-1, SCREEN, SCREEN, 3)
 
 
@@ -589,39 +579,45 @@ def bar_rows(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     return s.senses[lanes] + (3 * s.shown_action[lanes] + s.shown_gain[lanes]) * WIDTHS + s.red[lanes]
 
 
-def scene(s: State, art: Art, lanes: np.ndarray | slice, seen: np.ndarray | bool) -> np.ndarray:
+def scene(s: State, drawing: DrawingTables, lanes: np.ndarray | slice, seen: np.ndarray | bool) -> np.ndarray:
     """The lanes in full light, with the agents that are seen, (n,) bool or just True: (n, FRAME) uint8."""
     frames = s.scenery.take(s.floor[lanes], axis=0)
-    put_agent(s, art, lanes, frames, seen)
+    put_agent(s, drawing, lanes, frames, seen)
     return frames
 
 
-def furnish(s: State, art: Art, lane: int) -> None:
+def draw_scenery(s: State, drawing: DrawingTables, lane: int) -> None:
     """Draws the lane's scenery, whenever a coin or the exit has changed."""
     frames, twice = floors().take(s.floors[lane], axis=0), np.array([lane, lane])
-    put_coins(s, art, twice, frames, True)
-    put_exit(s, art, twice, frames, True)
+    put_coins(s, drawing, twice, frames, True)
+    put_exit(s, drawing, twice, frames, True)
     s.scenery[2 * lane : 2 * lane + 2] = frames
 
 
-def put_coins(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool) -> None:
+def put_coins(
+    s: State, drawing: DrawingTables, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool
+) -> None:
     """Draws the coins of the lanes that are shown, (n,) bool, into the frames, in place."""
     looks = s.props[lanes]
     for coin in range(COIN, s.bodies.shape[2]):
         pos = s.bodies[:, lanes, coin].T  # (n, 2)
-        put(frames, art.props, looks, pos, shown & (pos[:, 0] != GONE))
+        put(frames, drawing.props, looks, pos, shown & (pos[:, 0] != GONE))
 
 
-def put_exit(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool) -> None:
+def put_exit(
+    s: State, drawing: DrawingTables, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool
+) -> None:
     """Draws the exits of the lanes that are shown, (n,) bool, into the frames, in place."""
     pos = s.bodies[:, lanes, EXIT].T  # (n, 2)
-    put(frames, art.props, (s.props + s.is_open)[lanes] + 1, pos, shown & (pos[:, 0] != GONE))
+    put(frames, drawing.props, (s.props + s.is_open)[lanes] + 1, pos, shown & (pos[:, 0] != GONE))
 
 
-def put_agent(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool) -> None:
+def put_agent(
+    s: State, drawing: DrawingTables, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool
+) -> None:
     """Draws the agents of the lanes that are shown, (n,) bool, into the frames, in place."""
     if shown is True or np.count_nonzero(shown):
-        put(frames, art.figures, (s.figure * FACINGS + s.look)[lanes], s.pos[lanes], shown)
+        put(frames, drawing.figures, (s.figure * FACINGS + s.look)[lanes], s.pos[lanes], shown)
 
 
 def put(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, shown: np.ndarray | bool) -> None:
@@ -634,13 +630,13 @@ def put(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, sho
         paste(frames, sheet, rows[at], pos[at], at)
 
 
-def put_layer(s: State, art: Art, lanes: np.ndarray | slice, frames: np.ndarray, layer: int) -> None:
+def put_layer(s: State, drawing: DrawingTables, lanes: np.ndarray | slice, frames: np.ndarray, layer: int) -> None:
     """Draws the exits and agents that belong to this layer, which the darkness does not cover."""
-    put_exit(s, art, lanes, frames, s.exit_layer[lanes] == layer)
-    put_agent(s, art, lanes, frames, s.agent_layer[lanes] == layer)
+    put_exit(s, drawing, lanes, frames, s.exit_layer[lanes] == layer)
+    put_agent(s, drawing, lanes, frames, s.agent_layer[lanes] == layer)
 
 
-def shine(s: State, tables: Lamps, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
+def shine(s: State, tables: SpotStencils, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
     """What the spotlights light and, if any has a rim, which pixels those are: masks, (n, 588) uint16."""
     key = s.place[:, lanes, : int(s.count.max())].transpose(0, 2, 1).copy()  # (2, S, n)
     lit, rim = overlay(tables.disks.at(*key), tables.rims, key, s.rim[lanes])
@@ -706,7 +702,7 @@ FULL_SHARE = TILE_SHARE.min()  # of a tile beside the bar
 BLUE_LINES = sample((floors()[BLUE_FLOOR].reshape(SCREEN, SCREEN, 3) == BLUE).all(axis=-1))  # (42,) or red ones
 NO_BITS = np.uint64(0)
 READING = slice(0, 8)  # the entries that come from the bar
-# By opacity: (256, 2) all bits where the darkness is as good as none, and where it hides nothing; and, where only the
+# By opacity: (256, 2) all bits where the darkness changes nothing, and where it hides nothing; and, where only the
 # latter is true, how bright the floor is, (256,).
 VEIL = (np.arange(256)[:, None] <= (SLIGHT, FAINT)) * LINE
 DUSK = ((1 - np.arange(256) / 255) * (VEIL[:, 1] > VEIL[:, 0])).astype(np.float32)
@@ -730,7 +726,7 @@ def read_bars(bar: np.ndarray) -> np.ndarray:
     return np.stack(entries, axis=1).astype(np.float32)
 
 
-class Gauges(NamedTuple):
+class VectorTables(NamedTuple):
     """The tables that vectors are made of. Bodies are the agent, the exit (not in the endless id) and the coins."""
 
     width: int  # of a vector
@@ -738,9 +734,7 @@ class Gauges(NamedTuple):
     places: slice  # where those on the bodies' places are
     bars: np.ndarray
     readings: np.ndarray
-    shapes: (
-        Stencils  # samples of spotlights by radius, figures in all facings, and a coin, an exit, a door for each scale
-    )
+    shapes: Stencils  # samples: spotlights by radius, figures in all facings, a coin, an exit and a door for each scale
     rims: Stencils  # samples of spotlights' outlines
     high: Stencils  # masks of the bar's rows with the same shapes
     key: np.ndarray  # (K + 1, N) where the lanes' bodies are in those tables, and then the exit's door
@@ -750,10 +744,10 @@ class Gauges(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def gauge_shapes(
+def vector_shapes(
     least: int, largest: int, figure_scales: tuple[float, ...], scales: tuple[tuple[float, float], ...]
 ) -> tuple[Stencils, Stencils, Stencils]:
-    """Gauges' shapes, rims and high. Cached: environments with equal options share them."""
+    """VectorTables' shapes, rims and high. Cached: environments with equal options share them."""
     disks, rims = spot_shapes(least, largest)
     figures = [solid for scale in figure_scales for solid in sprites(scale)[1]]
     images, solids = draw_props(scales)
@@ -763,14 +757,14 @@ def gauge_shapes(
     return samples(shapes), samples(rims), stencils(shapes, BAR)
 
 
-class Scene(NamedTuple):
+class FrameSamples(NamedTuple):
     """n lanes' frames as samples, (n, 42) uint64 each, and the K bodies in them."""
 
     opacity: np.ndarray  # (n,) of the darkness
     lit: np.ndarray  # what it leaves out
     clear: np.ndarray  # what it does not hide
     rim: np.ndarray | None  # what of the light is white, if any lane has rims
-    x: np.ndarray  # (K, n) where the bodies are, as keys of the gauges
+    x: np.ndarray  # (K, n) where the bodies are, as keys of VectorTables.shapes
     y: np.ndarray  # (K, n)
     raised: np.ndarray  # (m,) which of the frames have bodies above the darkness
     layer: np.ndarray | None  # (K, m, 1) where those are: UNDER it, BELOW_BAR or ABOVE_BAR
@@ -779,19 +773,19 @@ class Scene(NamedTuple):
     floor: np.ndarray  # what nothing covers
 
 
-def describe(s: State, g: Gauges, lanes: np.ndarray | slice) -> np.ndarray:
+def describe(s: State, g: VectorTables, lanes: np.ndarray | slice) -> np.ndarray:
     """The vectors of the lanes, (n, V) float32, from the state alone. No frame is drawn.
 
     They are made of the colours of the bar and of every third pixel below it, so that equal frames have equal vectors.
     """
-    scene = survey(s, g, lanes)
-    out = np.zeros((len(scene.lit), g.width), np.float32)
-    describe_bar(s, g, lanes, scene, out)
-    describe_rest(s, g, lanes, scene, out)
+    sampled = sample_frames(s, g, lanes)
+    out = np.zeros((len(sampled.lit), g.width), np.float32)
+    describe_bar(s, g, lanes, sampled, out)
+    describe_rest(s, g, lanes, sampled, out)
     return out
 
 
-def survey(s: State, g: Gauges, lanes: np.ndarray | slice) -> Scene:
+def sample_frames(s: State, g: VectorTables, lanes: np.ndarray | slice) -> FrameSamples:
     """The lanes' frames as samples."""
     place, each = s.place[:, lanes, : int(s.count.max())], np.arange(len(s.pos))[lanes]
     spots, has_exit = place.shape[2], g.coin == COIN
@@ -812,11 +806,11 @@ def survey(s: State, g: Gauges, lanes: np.ndarray | slice) -> Scene:
         seen[:, raised], floor[raised] = uncover_layers(cover[:, raised], clear[raised], layer)
     if has_exit:
         seen[EXIT] &= shapes[-1]
-    return Scene(opacity, lit, clear, rim, *key[:, bodies], raised, layer, cover, seen, floor)
+    return FrameSamples(opacity, lit, clear, rim, *key[:, bodies], raised, layer, cover, seen, floor)
 
 
-def layers(s: State, g: Gauges, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
-    """Scene's raised and layer."""
+def layers(s: State, g: VectorTables, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
+    """FrameSamples' raised and layer."""
     coins = s.coin_age[lanes] < s.coin_show[lanes]
     (raised,) = (coins | s.layered[lanes]).nonzero()
     if not raised.size:
@@ -848,24 +842,24 @@ def uncover_layers(cover: np.ndarray, clear: np.ndarray, layer: np.ndarray) -> t
     return seen_above | seen_below, floor & free
 
 
-def describe_bar(s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, out: np.ndarray) -> None:
+def describe_bar(s: State, g: VectorTables, lanes: np.ndarray | slice, sampled: FrameSamples, out: np.ndarray) -> None:
     """Writes health, action and reward."""
     senses = bar_rows(s, lanes)
     out[:, READING] = g.readings.take(senses, axis=0)
-    if scene.layer is not None and (scene.layer == ABOVE_BAR).any():
-        high, over_bar = scene.raised, scene.layer == ABOVE_BAR  # (m,), (K, m, 1)
-        cover = g.high.at(scene.x[:, high], scene.y[:, high]) * over_bar  # (K, m, words)
+    if sampled.layer is not None and (sampled.layer == ABOVE_BAR).any():
+        high, over_bar = sampled.raised, sampled.layer == ABOVE_BAR  # (m,), (K, m, 1)
+        cover = g.high.at(sampled.x[:, high], sampled.y[:, high]) * over_bar  # (K, m, words)
         left = ~np.bitwise_or.reduce(cover, axis=0).view(np.uint16).reshape(-1, BAR, ITEMS)
         columns = unpacked(np.bitwise_or.reduce(left, axis=1))  # (m, 84) those of which anything is left
         out[high, READING] = read_bars(g.bars[senses[high]].reshape(-1, SCREEN, 3) * columns[..., None])
 
 
-def describe_rest(s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, out: np.ndarray) -> None:
+def describe_rest(s: State, g: VectorTables, lanes: np.ndarray | slice, sampled: FrameSamples, out: np.ndarray) -> None:
     """Writes the other entries."""
-    cover, seen, (bodies, n, _) = scene.cover, scene.seen, scene.seen.shape
-    bright, visible, dusk = scene.lit & scene.floor, scene.clear & scene.floor, DUSK.take(scene.opacity)
-    if scene.rim is not None:
-        bright = np.where(s.rim[lanes][:, None], rims_left(scene), bright)
+    cover, seen, (bodies, n, _) = sampled.cover, sampled.seen, sampled.seen.shape
+    bright, visible, dusk = sampled.lit & sampled.floor, sampled.clear & sampled.floor, DUSK.take(sampled.opacity)
+    if sampled.rim is not None:
+        bright = np.where(s.rim[lanes][:, None], rims_left(sampled), bright)
         dusk = dusk * ~s.rim[lanes]
     lines = np.empty((bodies + 3, n, LINES), np.uint64)
     lines[:bodies] = seen
@@ -883,7 +877,7 @@ def describe_rest(s: State, g: Gauges, lanes: np.ndarray | slice, scene: Scene, 
     describe_tiles(g, seen, any_[:bodies], bright, out)
 
 
-def describe_places(g: Gauges, seen: np.ndarray, any_: np.ndarray, out: np.ndarray) -> None:
+def describe_places(g: VectorTables, seen: np.ndarray, any_: np.ndarray, out: np.ndarray) -> None:
     """Writes how much of the bodies is visible and where that is. any_: (K, n) whether any is."""
     (bodies, n), kinds = any_.shape, g.coin + 1
     body, lane = any_.nonzero()
@@ -899,7 +893,7 @@ def describe_places(g: Gauges, seen: np.ndarray, any_: np.ndarray, out: np.ndarr
     out[:, g.places].reshape(n, kinds, 3)[lane, body] = total
 
 
-def describe_tiles(g: Gauges, seen: np.ndarray, any_: np.ndarray, bright: np.ndarray, out: np.ndarray) -> None:
+def describe_tiles(g: VectorTables, seen: np.ndarray, any_: np.ndarray, bright: np.ndarray, out: np.ndarray) -> None:
     """Writes which share of each tile shows light and coins (not in the endless id). any_: (K, n) whether any shows."""
     if "coins" not in g.at:
         out[:, g.at["light"]] = tile_counts(bright) * TILE_SHARE
@@ -910,12 +904,12 @@ def describe_tiles(g: Gauges, seen: np.ndarray, any_: np.ndarray, bright: np.nda
     out[:, g.at["light"]], out[lanes, g.at["coins"]] = share[: len(bright)], share[len(bright) :]
 
 
-def rims_left(scene: Scene) -> np.ndarray:
+def rims_left(sampled: FrameSamples) -> np.ndarray:
     """What is visible of the rims, (n, 42): of any in a dark that is dark enough, and over all that is under it."""
-    rim = scene.rim & LINES_BELOW & -(scene.opacity >= FIRST_RIM)[:, None].astype(np.uint64)
-    if scene.layer is not None:
-        above = np.where(scene.layer == UNDER, NO_BITS, scene.cover[:, scene.raised])
-        rim[scene.raised] &= ~np.bitwise_or.reduce(above, axis=0)
+    rim = sampled.rim & LINES_BELOW & -(sampled.opacity >= FIRST_RIM)[:, None].astype(np.uint64)
+    if sampled.layer is not None:
+        above = np.where(sampled.layer == UNDER, NO_BITS, sampled.cover[:, sampled.raised])
+        rim[sampled.raised] &= ~np.bitwise_or.reduce(above, axis=0)
     return rim
 
 
@@ -1000,8 +994,8 @@ class SearingSpotlights(MemoryGymVectorEnv):
     Episode end: terminated when no health is left, by leaving, without an exit by the last coin; in the endless id by
         `steps_per_coin` steps without a coin. Truncated after `max_steps` steps, unless it ends at that very step. An
         agent that knows everything needs 14 to 63 steps for the finite task, 33 on average (table 4.5).
-    Options: `VARIANTS[id].options`. Those marked * are lists, one entry of which is drawn at every reset. Radii and
-        speeds of spotlights are drawn between their smallest and largest.
+    Options: `VARIANTS[id].options`. Those marked * are lists, one entry of which is sampled at every reset. Radii and
+        speeds of spotlights are sampled between their smallest and largest.
     Ground truth: (6,) x and y of the agent, of the first coin left and of the exit; the endless id (4,) without the
         exit. In pixels over 84, so an agent that starts outside the screen has up to 86 / 84; 0 for what is not there.
     Final info: `reward`, `length`, `agent_health` (share left, negative if the last hit took more than that),
@@ -1011,7 +1005,9 @@ class SearingSpotlights(MemoryGymVectorEnv):
     Kept from the original: the bar shows the action and the reward of the step before the last. A spotlight behind one
     that is removed skips that step, and so does a coin behind a taken one when several are touched at once. The wait
     for the next spotlight is always the first of the planned intervals, as the last is what a spawn removes; so
-    spawn_interval_decay changes nothing, and neither does reward_max_steps. Radii of spotlights are whole pixels, from
+    spawn_interval_decay changes nothing, and neither does reward_max_steps. All coins but the first are a step old when
+    they are first shown, so in the dark they are seen in one frame less than `coin_show_duration` says. Radii of
+    spotlights are whole pixels, from
     spot_min_radius to spot_max_radius, both rounded down. The agent may start under the bar or outside the screen and
     steps inside with its first step; before that it is drawn facing up, and no spotlight shines. Dying at the exit is
     no success, though it pays. An endless task's coin may appear on the agent. Small coins (scale below 0.5) are all
@@ -1025,7 +1021,8 @@ class SearingSpotlights(MemoryGymVectorEnv):
     """
 
     variants = VARIANTS
-    tables = ("_wardrobe", "_art", "_gauges")
+    tables = ("_agent_tables", "_drawing", "_vector_tables")
+    growing = ("bodies", "touch", "spots", "spot_key", "place")
     kept = (*MemoryGymVectorEnv.kept, "_unlocked")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
@@ -1087,18 +1084,20 @@ class SearingSpotlights(MemoryGymVectorEnv):
 
     def place_tables(self) -> None:
         """The tables that step() looks things up in, and where each lane's rows start in them."""
-        self._wardrobe = wardrobe(tuple(figure for pair in self.figures for figure in pair))
+        self._agent_tables = agent_tables(tuple(figure for pair in self.figures for figure in pair))
         radii = [values[name] for values in self.settings for name in ("spot_min_radius", "spot_max_radius")]
         radii, endless = (int(min(radii)), int(max(radii))), self.variant.endless
         scratch = pixel_scratch(self.num_envs)
-        self._art = Art(lamps(*radii), self._wardrobe.sheet, props(self.scales), bars(endless), scratch)
+        self._drawing = DrawingTables(
+            spot_stencils(*radii), self._agent_tables.sheet, props(self.scales), bars(endless), scratch
+        )
         if self.obs_type == "vector":
-            self._gauges = self._make_gauges(*radii)
+            self._vector_tables = self._make_vector_tables(*radii)
         self._controls = free_controls()
         self._calm = np.arange(0, 2 * self.num_envs, 2)  # (N,) the scenery's calm rows
         self._lane_walk = (self.state.figure[:, None] + np.arange(2)) * (STRIDES * SPAN)  # (N, 2)
 
-    def _make_gauges(self, least: int, largest: int) -> Gauges:
+    def _make_vector_tables(self, least: int, largest: int) -> VectorTables:
         """The tables that vectors are made of, for spotlights of these radii."""
         s, figures = self.state, tuple(across.scale for across, _ in self.figures)
         coins = s.bodies.shape[2] - COIN
@@ -1107,9 +1106,9 @@ class SearingSpotlights(MemoryGymVectorEnv):
         bodies = [AGENT, EXIT, *range(COIN, COIN + coins), EXIT]
         if self.variant.endless:
             key, bodies = key[:-1:COIN], bodies[:-1:COIN]
-        shapes, rims, high = gauge_shapes(least, largest, figures, self.scales)
+        shapes, rims, high = vector_shapes(least, largest, figures, self.scales)
         at = vector_slices(self.variant.entries)
-        return Gauges(
+        return VectorTables(
             width=at["alarm"].stop,
             at=at,
             places=slice(at["agent"].start, at["coin"].stop),
@@ -1125,13 +1124,13 @@ class SearingSpotlights(MemoryGymVectorEnv):
         )
 
     def begin(self, lanes: np.ndarray) -> None:
-        """Draws the lanes' next levels and starts their episodes."""
+        """Samples the lanes' next levels and starts their episodes."""
         for lane in lanes.tolist():
             values = self.settings[lane]
             spawns = NO_LIMIT if self.variant.endless else _limit(values["num_spawns"])
-            level = draw_level(self._rngs[lane], values, self.variant)
+            level = sample_level(self._rngs[lane], values, self.variant)
             write_level(self.state, lane, level, spawns)
-            self._furnish(lane)
+            self._draw_scenery(lane)
             if not level.coins:
                 self._unlocked.append(lane)
 
@@ -1143,7 +1142,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         while self._unlocked:
             lane = self._unlocked.pop()
             s.is_open[lane] = s.left[lane] == 0
-            self._furnish(lane)
+            self._draw_scenery(lane)
         s.wait -= 1
         due = s.wait == 0
         if np.count_nonzero(due):
@@ -1168,7 +1167,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         s = self.state
         action = actions[:, 0] * 3 + actions[:, 1]  # (N,)
         s.shown_action, s.last_action = s.last_action, action
-        s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._wardrobe.walk)
+        s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._agent_tables.walk)
         s.look = s.facing
         np.subtract(s.pos.T, PAD, out=s.bodies[:, :, AGENT])
 
@@ -1176,7 +1175,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         """Adds a spotlight to the lane's, if there is room."""
         s = self.state
         if s.count[lane] < MOST_SPOTS:
-            add_spot(s, lane, draw_spot(self._rngs[lane], self.settings[lane]))
+            add_spot(s, lane, sample_spot(self._rngs[lane], self.settings[lane]))
         s.spawns[lane] -= 1
         # Always the first interval of the original's list, as its spawns remove the last one.
         s.wait[lane] = s.interval[lane] if s.spawns[lane] else NO_LIMIT
@@ -1208,10 +1207,10 @@ class SearingSpotlights(MemoryGymVectorEnv):
             last = tuple(s.bodies[:, lane, COIN].tolist())
             rewards[lane] += s.reward_coin[lane] * take_coins(s, lane, touched[lane])
             if self.variant.endless:
-                s.bodies[:, lane, COIN] = draw_coin(words(self._rngs[lane]), last)
+                s.bodies[:, lane, COIN] = sample_coin(words(self._rngs[lane]), last)
                 s.left[lane], s.coin_age[lane] = 1, 0
                 aim(s, lane)
-            self._furnish(lane)
+            self._draw_scenery(lane)
 
     def _leave(self, touched: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
         """Ends the episodes whose agent stands at the open exit or, without one, has just taken the last coin."""
@@ -1232,21 +1231,21 @@ class SearingSpotlights(MemoryGymVectorEnv):
         s.returned += rewards
         return (s.length == s.limit) & ~terminated
 
-    def _furnish(self, lane: int) -> None:
-        """Draws the lane's scenery anew, unless nothing but frames() needs it."""
+    def _draw_scenery(self, lane: int) -> None:
+        """Draws the lane's scenery again, unless nothing but frames() needs it."""
         if self.obs_type == "pixels":
-            furnish(self.state, self._art, lane)
+            draw_scenery(self.state, self._drawing, lane)
 
     def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3)."""
         if self.obs_type == "vector":
             for lane in np.arange(self.num_envs)[lanes].tolist():
-                furnish(self.state, self._art, lane)
-        return draw(self.state, self._art, lanes)
+                draw_scenery(self.state, self._drawing, lane)
+        return draw(self.state, self._drawing, lanes)
 
     def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32: see VARIANTS[id].entries."""
-        return describe(self.state, self._gauges, lanes)
+        return describe(self.state, self._vector_tables, lanes)
 
     def ground_truth(self) -> np.ndarray:
         """A fresh (N, 6), or (N, 4) in the endless id: the agent's, the coin's and the exit's x and y, over 84."""
@@ -1270,7 +1269,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Lights everything below the bar, and circles the spotlights."""
         s, lanes = self.state, np.array([lane])
-        lit = scene(s, self._art, lanes, True)
+        lit = scene(s, self._drawing, lanes, True)
         below = slice(BAR * DEBUG_ZOOM, None)
         frame[below] = magnify(lit.reshape(SCREEN, SCREEN, 3), DEBUG_ZOOM)[below]
         for slot in np.flatnonzero(s.place[0, lane]).tolist():

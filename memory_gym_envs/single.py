@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import ALL, RENDER_MODES
+from memory_gym_envs.base import ALL, RENDER_MODES, lane_seeds
 from memory_gym_envs.options import brief
 
 
@@ -40,9 +40,9 @@ class MemoryGymEnv(gym.Env):
         Raises ValueError for a wrong seed or option; nothing has changed then.
         """
         if isinstance(seed, (list, tuple, np.ndarray)):
-            raise ValueError(f"seed must be an integer or None, not {seed!r}")
+            raise ValueError(f"seed must be an integer or None, not {brief(seed)}")
         batch = self.batch
-        batch.restart(np.zeros(1, np.intp), batch._lane_seeds(seed), batch.resolve(options))
+        batch.restart(np.zeros(1, np.intp), lane_seeds(seed, 1), batch.resolve(options))
         self._needs_reset = False
         return _only(batch.observe(ALL)), {"ground_truth": batch.ground_truth()[0]}
 

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from memory_gym_envs.base import ALL, one_of, overwrite
+from memory_gym_envs.base import ALL, lane_seeds, one_of, overwrite
 from memory_gym_envs.bits import pixels
 from memory_gym_envs.drawing import FRAME, SCREEN
 from memory_gym_envs.options import brief, resolve
@@ -24,9 +24,9 @@ from memory_gym_envs.searing_spotlights import (
     TIME,
     VARIANTS,
     SearingSpotlights,
-    lamps,
     shine,
     spot_places,
+    spot_stencils,
 )
 
 OBSERVATION = "observation"  # the name of an observation that is no Dict, where it becomes a part of one
@@ -72,13 +72,11 @@ class SameStepWrapper(Saved, VectorWrapper):
 
     def reset(self, *, seed: Any = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts new episodes; arguments and errors are the environment's."""
-        mask = (options or {}).get("reset_mask")  # Gymnasium's own vector environments take it out
+        # Read before, since Gymnasium's own vector environments take it out.
+        mask = options.get("reset_mask") if isinstance(options, Mapping) else None
+        seeds = lane_seeds(seed, self.num_envs)
         observations, infos = self.env.reset(seed=seed, options=options)
         lanes = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-        if seed is None or isinstance(seed, (int, np.integer)):
-            seeds = [None if seed is None else int(seed) + lane for lane in range(self.num_envs)]
-        else:
-            seeds = list(seed)
         self.begin(_rows(observations, lanes), lanes, seeds)
         return self.wrap(observations, ALL), infos
 
@@ -337,7 +335,7 @@ class SpotlightPerturbation(PictureWrapper):
         self._light.set_state(state)
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
-        """Draws the first spotlights of the lanes' episodes."""
+        """Samples the first spotlights of the lanes' episodes."""
         for lane in lanes.tolist():
             if seeds[lane] is not None:
                 stream = np.random.SeedSequence(seeds[lane], spawn_key=(SPOT_STREAM,))
@@ -355,7 +353,7 @@ class SpotlightPerturbation(PictureWrapper):
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
         """The lanes' observations, with the veil wherever no spotlight is."""
         frames = self.picture(observations).reshape(-1, FRAME)  # (n, FRAME)
-        bits, _ = shine(self._light.state, lamps(*self._radii), lanes)
+        bits, _ = shine(self._light.state, spot_stencils(*self._radii), lanes)
         veiled = frames * self.clear
         veiled += self.veil
         veiled //= np.uint16(255)

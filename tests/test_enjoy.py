@@ -24,7 +24,6 @@ from selenium.webdriver.support.ui import Select, WebDriverWait
 import enjoy
 import ppo_gru
 import ppo_trxl
-from memory_gym_envs.making import parse_options
 
 AGENTS = {
     "GRU": (ppo_gru, {"env_id": "MysteryPath-Grid-v0", "reconstruction_coef": 0.1, "ground_truth_coef": 0.1}),
@@ -57,9 +56,8 @@ def saved(tiny):
 
 
 def played(seed=3, max_steps=60):
-    agent, envs, args = enjoy.load("model.pt")
-    options = parse_options(args.env_id, args.env_options)
-    return enjoy.play(agent, envs, seed, options, max_steps)
+    agent, envs, _ = enjoy.load("model.pt")
+    return enjoy.play(agent, envs, seed, max_steps)
 
 
 def data_of(page):
@@ -106,7 +104,7 @@ def test_the_episode_is_the_agents(flags, saved, monkeypatch):
     """Played again with the agent's own `act`: the same pictures, numbers and attention, step for step."""
     saved(ppo_trxl, env_id="MortarMayhem-Grid-v0", **flags)
     agent, envs, _ = enjoy.load("model.pt")
-    episode = enjoy.play(agent, envs, 3, None, 60)
+    episode = enjoy.play(agent, envs, 3, 60)
     page = enjoy.page_data(episode, "MortarMayhem-Grid-v0", {})
     view, truth = map(frames_of, page["videos"])
     used, forward = [], ppo_trxl.Attention.forward

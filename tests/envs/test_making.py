@@ -662,6 +662,8 @@ CASES = [
     ("MysteryPath-v0", {"num_levels": -1}, "MysteryPath-v0 cannot be made: num_levels"),
     ("MysteryPath-v0", {"obs_type": "sound"}, "MysteryPath-v0 cannot be made: obs_type"),
     ("MortarMayhem-v0", {"seed": 0, "options": {"comand_count": [3]}}, "comand_count.*command_count"),
+    ("CartPole-v1", {"options": {"max_steps": 5}}, "CartPole-v1 has none"),
+    (".foo:x-v0", {}, "the module of .foo:x-v0 begins with a dot"),
     (register(Broken), {}, "cannot be made: 'no such.*file'"),
     (register(Shows), {}, "cannot be made: .*space"),
     (register(Old, space=NUMBER), {"seed": 0}, "cannot be reset: .*unexpected keyword argument"),
@@ -750,9 +752,26 @@ def test_errors_of_the_installation_stay_as_they_are_in_the_first_reset(error):
         make_envs(register(Unready, error=error), 2, seed=0)
 
 
-def test_lanes_count_from_zero():
-    with pytest.raises(ValueError, match="first_lane must be an integer of at least 0, not -1"):
-        make_envs("CartPole-v1", 2, first_lane=-1)
+@pytest.mark.parametrize("wrong", [-1, 1.5, "a"])
+def test_lanes_count_from_zero(wrong):
+    with pytest.raises(ValueError, match=f"first_lane must be an integer of at least 0, not {wrong!r}"):
+        make_envs("CartPole-v1", 2, first_lane=wrong)
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "MysteryPath-v0"])
+def test_there_is_at_least_one_lane(env_id):
+    with pytest.raises(ValueError, match="num_envs must be an integer of at least 1, not 0"):
+        make_envs(env_id, 0)
+
+
+@pytest.mark.parametrize("seed", [None, 1])
+def test_options_are_the_defaults_of_every_reset(seed):
+    envs = make_envs("MysteryPath-v0", 2, seed=seed, options={"max_steps": 5})
+    envs.reset()
+    ended = [envs.step(envs.action_space.sample())[3].all() for _ in range(10)]
+    assert ended == ([False] * 4 + [True]) * 2
+    envs.reset(options={"max_steps": 4})
+    assert [envs.step(envs.action_space.sample())[3].all() for _ in range(4)] == [False] * 3 + [True]
 
 
 def test_other_autoreset_is_refused():

@@ -21,8 +21,8 @@ from memory_gym_envs.mystery_path import (
     SOUTH,
     TILE,
     WEST,
-    draw_segments,
     read_ahead,
+    sample_segments,
     trail,
 )
 
@@ -97,7 +97,7 @@ def test_endless_paths_are_joined_by_transition_tiles():
 def further(rng, *arguments):
     """The endless path's next segments from this generator."""
     tape = read_ahead(rng, FIRST_SEGMENTS)
-    level = draw_segments(tape, *arguments)
+    level = sample_segments(tape, *arguments)
     tape.close()
     return level
 

@@ -94,7 +94,7 @@ def test_plays_on_with_the_present_options(env_id, obs_type, everything):
     arguments = {"obs_type": obs_type, "num_levels": 50} | (EVERYTHING if everything else {})
     arguments["spotlight_perturbation"] = everything and obs_type == "pixels"
     options = OPTIONS[env_id]
-    envs = make_envs(env_id, LANES, seed=3, options=options, **arguments)
+    envs = make_envs(env_id, LANES, seed=3, **arguments)
     envs.reset(options=options)
     check_resumes(envs, lambda: make_envs(env_id, LANES, **arguments), (1, 100))
 
@@ -103,10 +103,11 @@ def test_plays_on_with_the_present_options(env_id, obs_type, everything):
 def test_plays_on_after_many_episodes(env_id, obs_type):
     """Into environments that have been seeded, and reset with other options."""
     options = HASTY[FAMILY[env_id]]
-    envs = make_envs(env_id, LANES, seed=3, options=options, obs_type=obs_type)
+    envs = make_envs(env_id, LANES, seed=3, obs_type=obs_type)
     envs.reset(options=options)
-    made = {"seed": 8, "options": CHANGED[FAMILY[env_id]]}
-    ends = check_resumes(envs, lambda: make_envs(env_id, LANES, obs_type=obs_type, **made), (200,))
+    again = make_envs(env_id, LANES, seed=8, obs_type=obs_type)
+    again.reset(options=CHANGED[FAMILY[env_id]])
+    ends = check_resumes(envs, lambda: again, (200,))
     assert ends > 3 * LANES
 
 
@@ -289,6 +290,32 @@ def test_a_state_of_another_version():
 def test_a_generator_of_no_known_kind():
     with pytest.raises(ValueError, match="unknown kind, 'seed'"):
         restored({"bit_generator": "seed"})
+
+
+@pytest.mark.parametrize("part", ["environment", "wrapper"])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda parts, at: parts.clear(),
+        lambda parts, at: parts.__setitem__(at, {}),
+        lambda parts, at: parts.__setitem__(at, None),
+        lambda parts, at: parts[at].popitem(),
+        lambda parts, at: parts[0]["arrays"].update(pos=np.zeros((2, 3), np.int64)),
+        lambda parts, at: parts[0]["arrays"].update(cell=parts[0]["arrays"]["cell"][:1]),
+        lambda parts, at: parts[0]["settings"].pop(),
+    ],
+    ids=["no parts", "no entries", "None", "one entry less", "shape", "lanes", "settings"],
+)
+def test_a_spoiled_state_changes_nothing(part, spoil):
+    envs = make_envs("MysteryPath-v0", 2, step_encoding=True)
+    envs.reset(seed=0)
+    state = save_state(envs)
+    spoil(state["parts"], 0 if part == "environment" else 1)
+    envs.step(np.zeros((2, 2), np.int64))
+    before = save_state(envs)
+    with pytest.raises(ValueError, match="this is no state of MysteryPath-v0: "):
+        load_state(envs, state)
+    check_same(save_state(envs), before)
 
 
 def test_what_is_no_state():

@@ -8,7 +8,7 @@ from collections import defaultdict
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import has
+from helpers import EACH, MORTAR
 from players import FAMILY, player, stumbling
 
 from memory_gym_envs import IDS, MortarMayhem, MysteryPath, SearingSpotlights
@@ -18,9 +18,6 @@ from memory_gym_envs.entries import vector_slices, vector_space
 from memory_gym_envs.mortar_mayhem import COMMANDS, SYMBOL, SYMBOL_AT
 from memory_gym_envs.mystery_path import BEYOND, ROWS, SIDE
 
-VECTOR_IDS = [env_id for env_id in IDS if has(env_id, "vector")]
-EACH = pytest.mark.parametrize("env_id", VECTOR_IDS)
-MORTAR = pytest.mark.parametrize("env_id", [env_id for env_id in VECTOR_IDS if env_id in MortarMayhem.variants])
 LANES, STEPS = 48, 120
 OPTIONS = {  # played one after the other, each by the ids that have its options
     MortarMayhem: [
@@ -40,6 +37,8 @@ OPTIONS = {  # played one after the other, each by the ids that have its options
         {"show_background": True, "show_stamina": True},
         {"camera_offset_scale": 2.3, "agent_speed": 4.6, "show_background": True},
         {"camera_offset_scale": 0.6},
+        {"camera_offset_scale": 1.331},
+        {"camera_offset_scale": 1.331, "agent_scale": 0.6},
         {"camera_offset_scale": 5.5, "agent_scale": 1.0, "show_stamina": True},
         {"camera_offset_scale": 1.0, "agent_scale": 0.5, "agent_speed": 1.0},
         {"show_past_path": False, "agent_speed": 15.0},
@@ -54,8 +53,8 @@ OPTIONS = {  # played one after the other, each by the ids that have its options
 }
 CASES = [
     pytest.param(env_id, options, id="-".join([env_id, *map(str, options)]))
-    for env_id in VECTOR_IDS
-    for options in OPTIONS.get(FAMILY[env_id], [{}])
+    for env_id in IDS
+    for options in OPTIONS[FAMILY[env_id]]
     if set(options) <= {option.name for option in FAMILY[env_id].variants[env_id].options}
 ]
 # Different frames may have equal vectors where large agents hide most of a tile, where only the edge of a past tile
@@ -126,8 +125,6 @@ def look(env_id, options, **state):
     # All lanes have the same level, but for what is set.
     for name in envs.state.__dataclass_fields__:
         field = getattr(envs.state, name)
-        if field.dtype == object:  # lists, of what no frame shows
-            continue
         field[:] = state.get(name, field[0] if len(field) else field)
     return envs, check(zip(unique(envs.frames(ALL)), envs.vectors(ALL), envs.ground_truth(), strict=True))
 

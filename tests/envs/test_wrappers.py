@@ -12,7 +12,7 @@ from gymnasium.wrappers import FrameStackObservation, TransformObservation
 from players import choices
 
 from memory_gym_envs.searing_spotlights import BEND, START, TOWARD
-from memory_gym_envs.wrappers import HEAD_START, GrayscaleStack, SpotlightPerturbation, StepEncoding, VectorStack, gray
+from memory_gym_envs.wrappers import GrayscaleStack, SpotlightPerturbation, StepEncoding, VectorStack, gray
 
 LANES = 3
 SHORT = "Endless-MysteryPath-v0", "MortarMayhemB-Grid-v0"  # whose random episodes are; a picture and a Dict
@@ -140,8 +140,8 @@ def test_failed_reset_changes_nothing(wrapper):
     for each in (envs, twin):
         each.reset(seed=0)
         list(roll(each, 10))
-    for wrong in ({"seed": -1}, {"seed": [1, 2]}, {"options": {"agent_skale": 1}}):
-        with pytest.raises(ValueError, match=r"seed|agent_scale"):
+    for wrong in ({"seed": -1}, {"seed": [1, 2]}, {"options": {"agent_skale": 1}}, {"options": [("max_steps", 5)]}):
+        with pytest.raises(ValueError, match=r"seed|agent_scale|must be a dictionary"):
             envs.reset(**wrong)
     for left, right in zip(roll(envs, 80), roll(twin, 80), strict=True):
         assert data_equivalence(left[0], right[0], exact=True)
@@ -359,7 +359,7 @@ def test_spotlights_are_disks_on_their_way():
         shown = [lit(envs.reset(seed=seed)[0]), *(lit(step[0]) for step in roll(envs, 15))]
         start, toward, bend = (envs._light.state.spots[part, :, 0] for part in (START, TOWARD, BEND))  # (2, N)
         for step, lanes in enumerate(shown):
-            time = HEAD_START + step * speed
+            time = 0.3 + step * speed  # the author's head start
             for lane, (x, y) in enumerate((start + time * (toward + time * bend)).T.astype(int)):
                 if radius <= x <= 84 - radius and radius <= y <= 84 - radius:
                     rows, columns = lanes[lane].nonzero()
