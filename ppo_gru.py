@@ -209,6 +209,8 @@ class Args:
     --trxl-dim is its width)"""
     head_size: PositiveInt = 512
     """width of the layer after the memory, and of the heads' own layers"""
+    value_init_gain: NonNegativeFloat = 1.0
+    """gain of the value's last layer at initialization: below 1, values begin nearer to 0"""
 
     eval_interval: NonNegativeInt = 0
     """iterations from one evaluation to the next, and one at the end, on levels that are not trained on (0: none)"""
@@ -505,12 +507,12 @@ class Encoder(nn.Module):
 class Heads(nn.Module):
     """The layer after the memory, the multi-discrete policy and the state value (table 6.2)."""
 
-    def __init__(self, width: int, nvec: list[int], size: int):
+    def __init__(self, width: int, nvec: list[int], size: int, value_gain: float):
         super().__init__()
         self.nvec = nvec  # number of actions of each branch, as Gymnasium calls it
         self.trunk = layer_init(nn.Linear(width, size))
         self.policy = head(size, sum(nvec), 0.1)
-        self.value = head(size, 1, 1.0)
+        self.value = head(size, 1, value_gain)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Map the memory's output (B, D) to the logits of all branches, values (B,) and features (B, F)."""
@@ -681,7 +683,7 @@ class Agent(nn.Module):
         super().__init__()
         self.encoder = Encoder(space.spaces, memory_width(args) if args.embedding else None, args.vector_frequencies)
         self.memory = Memory(args, self.encoder.width)
-        self.heads = Heads(self.memory.width, nvec, args.head_size)
+        self.heads = Heads(self.memory.width, nvec, args.head_size, args.value_init_gain)
         with torch.random.fork_rng([]):  # with and without these, the random numbers that follow are the same
             self.decoder = Decoder(args.head_size, space.spaces) if args.reconstruction_coef else None
             self.estimator = head(args.head_size, ground_truth_size, 1.0) if args.ground_truth_coef else None

@@ -24,6 +24,19 @@ def test_parameter_counts_of_the_transformers():
     assert [sum(p.numel() for p in agent.parameters()) for agent in agents] == [4_226_597, 9_537_317]
 
 
+@pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
+def test_the_value_s_gain_at_initialization(script):
+    """Orthogonal initialization scales one random row, so fresh values are proportional to the gain."""
+    values = []
+    for gain in (1.0, 0.25, 0.0):
+        torch.manual_seed(1)
+        agent = script.Agent(PIXELS, [4], script.Args(value_init_gain=gain))
+        values.append(agent.heads(torch.linspace(-1, 1, 4 * agent.memory.width).reshape(4, -1))[1])
+    torch.testing.assert_close(values[1], values[0] / 4)
+    assert values[0].any()
+    assert not values[2].any()
+
+
 def test_sizes_of_table_6_2():
     agent = Agent(PIXELS, [3, 3], Args())
     assert agent.encoder.cnns[0](torch.zeros(2, 84, 84, 3, dtype=torch.uint8)).shape == (2, 3136)
