@@ -255,6 +255,8 @@ PRESETS = {
 # What shapes the network; an error message names these if weights do not fit.
 OBSERVATION_FLAGS = ("env_id", "obs_type", "frame_stack", "step_encoding", "observe_last_action", "vector_frequencies")
 NETWORK_FLAGS = (*OBSERVATION_FLAGS, "embedding", "head_size", "memory", "hidden_size", "num_layers")
+# Flags that change nothing unless another one has one of these values.
+NEEDS = dict.fromkeys(("num_layers", "seq_len", "refresh_memory"), ("memory", ("gru", "lstm")))
 
 
 def memory_width(args: Args) -> int:
@@ -516,8 +518,9 @@ class Heads(nn.Module):
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Map the memory's output (B, D) to the logits of all branches, values (B,) and features (B, F)."""
-        features = F.relu(self.trunk(x))
-        return self.policy(features).float(), self.value(features)[:, 0].float(), features
+        with torch.autocast(x.device.type, enabled=False):  # --amp: bfloat16 is too coarse for values and log-ratios
+            features = F.relu(self.trunk(x.float()))
+            return self.policy(features), self.value(features)[:, 0], features
 
     def distributions(self, logits: Tensor) -> list[Categorical]:
         """Make the distribution of each branch's action from the logits of all branches."""
@@ -707,14 +710,13 @@ class Agent(nn.Module):
         return self.heads(x)[1]
 
     def evaluate_actions(
-        self, observations: "UniqueObservations", actions: Tensor, pieces: Pieces, state: MemoryState
+        self, x: Tensor, actions: Tensor, pieces: Pieces, state: MemoryState
     ) -> tuple[list[Categorical], Tensor, Tensor, Tensor]:
         """Recompute, with gradient, what `get_action_and_value` computed at the steps of the pieces.
 
-        Returns the policy, a distribution of B actions for each branch, the log-probabilities (B, A) of the actions
-        (B, A), values (B,) and features (B, F).
+        x: the steps' encoded observations (B, I). Returns the policy, a distribution of B actions for each branch, the
+        log-probabilities (B, A) of the actions (B, A), values (B,) and features (B, F).
         """
-        x = observations.encode(self.encoder, pieces.flat_index())  # (B, I); section 9: on a CPU, equal ones once
         logits, values, features = self.heads(self.memory.unroll(x, pieces, state))
         policy = self.heads.distributions(logits)
         return policy, log_probs_of(policy, actions), values, features
@@ -838,8 +840,9 @@ def ppo_loss(
         return stored.flatten(0, 1).index_select(0, index)  # (T, N, ...) to (B, ...)
 
     with autocast(args, index.device):
+        x = observations.encode(agent.encoder, index)  # (B, I); section 9: on a CPU, equal ones once
         policy, log_probs, values, features = agent.evaluate_actions(
-            observations, gather(rollout.actions), minibatch, rollout.memory_state
+            x, gather(rollout.actions), minibatch, rollout.memory_state
         )
     log_ratio = log_probs - gather(rollout.log_probs)  # (B, A)
     advantages, old_values, returns = gather(rollout.advantages), gather(rollout.values), gather(rollout.returns)
@@ -857,7 +860,7 @@ def ppo_loss(
         logs["reconstruction_loss"] = reconstruction_loss(logits.float(), gather(rollout.obs[agent.encoder.images[0]]))
         loss = loss + args.reconstruction_coef * logs["reconstruction_loss"]
     if agent.estimator is not None:  # (5.6)
-        estimate = agent.estimator((features.detach() if args.ground_truth_detach else features).float())  # (B, G)
+        estimate = agent.estimator(features.detach() if args.ground_truth_detach else features)  # (B, G)
         logs["ground_truth_loss"] = F.mse_loss(estimate, gather(rollout.ground_truth))
         loss = loss + args.ground_truth_coef * logs["ground_truth_loss"]
     logs |= {"loss": loss, **policy_metrics(log_ratio, args.clip_coef)}
@@ -885,7 +888,7 @@ def update(
 ) -> dict[str, float]:
     """Learn from the rollout for some epochs; return what to log, averaged over the minibatches.
 
-    Raises FloatingPointError before a step that would spoil the weights.
+    Raises FloatingPointError if a loss or a gradient was not finite; the weights are of no use then.
     """
     if args.norm_adv == "batch":
         rollout.advantages = normalize(rollout.advantages)
@@ -893,30 +896,24 @@ def update(
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
     clipped_together = groups_to_clip(agent, args)
     logs = []
-    for epoch in range(args.update_epochs):
-        if args.refresh_memory and epoch > 0:
-            refresh_memory(agent, rollout, args)
-        for minibatch in pieces.minibatches(args.num_minibatches):
-            loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
-            if args.target_kl is not None and logs:  # before the first step, the policy is still the one that acted
-                kl = np.mean(all_gather(log["approx_kl"].item()))  # section 8: of all processes, which stop together
-                if kl > args.target_kl:
-                    break
-            optimizer.zero_grad()
-            loss.backward()
-            average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
-            norms = [nn.utils.clip_grad_norm_(group, args.max_grad_norm) for group in clipped_together]
-            log["grad_norm"] = norms[0]
-            if not torch.stack([log["loss"], *norms]).isfinite().all():
-                raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
-            optimizer.step()
-            logs.append(log)
-        else:
-            continue  # with the next epoch
-        break  # --target-kl was exceeded
+    for minibatch in minibatches_of_all_epochs(agent, rollout, pieces, args):
+        loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
+        if args.target_kl is not None and logs:  # before the first step, the policy is still the one that acted
+            kl = np.mean(all_gather(log["approx_kl"].item()))  # section 8: of all processes, which stop together
+            if kl > args.target_kl:
+                break
+        optimizer.zero_grad()
+        loss.backward()
+        average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
+        norms = [nn.utils.clip_grad_norm_(group, args.max_grad_norm) for group in clipped_together]
+        log |= {"grad_norm": norms[0], "largest_norm": torch.stack(norms).max()}
+        optimizer.step()
+        logs.append(log)
 
-    means = torch.stack([torch.stack([*log.values()]) for log in logs]).mean(0)  # over minibatches; asks a GPU once
-    losses = dict(zip(logs[0], means.tolist(), strict=True))
+    means = torch.stack([torch.stack([*log.values()]) for log in logs]).mean(0)  # over minibatches
+    losses = dict(zip(logs[0], means.tolist(), strict=True))  # asks a GPU once, for all minibatches
+    if not math.isfinite(losses["loss"] + losses.pop("largest_norm")):
+        raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
     # Before the first gradient step the weights are those that acted, so every ratio has to be 1.
     losses["ratio_error"] = logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
@@ -925,14 +922,22 @@ def update(
     return {f"losses/{k}": v for k, v in losses.items()} | {f"charts/{k}": v for k, v in charts.items()}
 
 
+def minibatches_of_all_epochs(agent: Agent, rollout: Rollout, pieces: Pieces, args: Args) -> Iterator[Pieces]:
+    """Yield the minibatches of one epoch after the other, all of a rollout's pieces in each."""
+    for epoch in range(args.update_epochs):
+        if args.refresh_memory and epoch > 0:
+            refresh_memory(agent, rollout, args)
+        yield from pieces.minibatches(args.num_minibatches)
+
+
 def groups_to_clip(agent: Agent, args: Args) -> list[list[nn.Parameter]]:
     """Return the parameters whose gradients are clipped together: the agent's first, then each detached head's.
 
     A detached head is a probe of what the features hold: if its gradient had a share of the norm, clipping would change
     the agent's step.
     """
-    heads = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
-    probes = [[*head.parameters()] for head, detached in heads if head is not None and detached]
+    auxiliary = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
+    probes = [[*network.parameters()] for network, detached in auxiliary if network is not None and detached]
     in_probes = {*itertools.chain(*probes)}
     return [[parameter for parameter in agent.parameters() if parameter not in in_probes], *probes]
 
@@ -1105,6 +1110,12 @@ def check_args(args: Args) -> None:
             raise ValueError(f"{flag(name)} is {value}; it must be below 2 ** 63")
     if not args.exp_name or set(args.exp_name) & set("/\\"):
         raise ValueError(f"--exp-name is {args.exp_name!r}; it must be a name without slashes")
+    for name in ("reconstruction", "ground_truth"):
+        if getattr(args, f"{name}_detach") and not getattr(args, f"{name}_coef"):
+            raise ValueError(f"{flag(f'{name}_detach')} needs {flag(f'{name}_coef')} above 0")
+    for name, (other, values) in NEEDS.items():
+        if getattr(args, name) != getattr(Args, name) and getattr(args, other) not in values:
+            raise ValueError(f"{flag(name)} needs {flag(other)} {' or '.join(values)}; without, it changes nothing")
     batch_size = args.num_envs * args.num_steps
     if args.total_timesteps < batch_size:
         raise ValueError(
@@ -1701,7 +1712,6 @@ def speed_up(agent: Agent, args: Args) -> None:
         images.forward = in_chunks(images.forward)
     if args.amp:
         agent.encoder.forward = pad_batch(agent.encoder.forward)
-        agent.heads.forward = pad_batch(agent.heads.forward)
 
 
 CHUNK = 256  # images; the backward pass of 2,048 at once takes about 1.5 times as long on a CPU, for its caches
@@ -1718,7 +1728,7 @@ def in_chunks(forward: Callable) -> Callable:
 
 
 def pad_batch(forward: Callable, multiple: int = 16) -> Callable:
-    """Return a function that computes with a batch padded to a multiple, and drops the padding again.
+    """Return a function of a dict of batches that pads them to a multiple, and drops the padding again.
 
     In bfloat16, a CPU's kernels are compiled for every batch size, which can take longer than running them.
     """
@@ -1726,10 +1736,8 @@ def pad_batch(forward: Callable, multiple: int = 16) -> Callable:
     def pad(x: Tensor) -> Tensor:
         return F.pad(x, [0, 0] * (x.dim() - 1) + [0, -len(x) % multiple])
 
-    def padded(x: Tensor | dict[str, Tensor]) -> Tensor | tuple[Tensor, ...]:
-        rows = len(next(iter(x.values())) if isinstance(x, dict) else x)
-        y = forward({name: pad(part) for name, part in x.items()} if isinstance(x, dict) else pad(x))
-        return tuple(part[:rows] for part in y) if isinstance(y, tuple) else y[:rows]
+    def padded(x: dict[str, Tensor]) -> Tensor:
+        return forward({name: pad(part) for name, part in x.items()})[: len(next(iter(x.values())))]
 
     return padded
 

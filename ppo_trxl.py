@@ -236,7 +236,7 @@ class Args:
     trxl_positional_encoding: Literal["absolute", "learned", "relative", "none"] = "absolute"
     """what tells the order of the steps that are looked back at"""
     trxl_query_position: bool = False
-    """add the encoding of its own step to the first block's query too"""
+    """add the encoding of its own step to the first block's query: the learned one, or else the absolute one"""
     trxl_query_output: bool = False
     """add a projection of the last block's output of the step before to the first block's query, without gradient"""
     trxl_pe_length: PositiveInt = 2048
@@ -294,6 +294,8 @@ BLOCK_FLAGS = (
     "trxl_gate",
 )
 NETWORK_FLAGS = (*OBSERVATION_FLAGS, "embedding", "head_size", *BLOCK_FLAGS)
+# Flags that change nothing unless another one has one of these values.
+NEEDS = {"trxl_gate_bias": ("trxl_gate", ("gru",)), "trxl_pe_length": ("trxl_positional_encoding", ("learned",))}
 
 
 def memory_width(args: Args) -> int:
@@ -555,8 +557,9 @@ class Heads(nn.Module):
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Map the memory's output (B, D) to the logits of all branches, values (B,) and features (B, F)."""
-        features = F.relu(self.trunk(x))
-        return self.policy(features).float(), self.value(features)[:, 0].float(), features
+        with torch.autocast(x.device.type, enabled=False):  # --amp: bfloat16 is too coarse for values and log-ratios
+            features = F.relu(self.trunk(x.float()))
+            return self.policy(features), self.value(features)[:, 0], features
 
     def distributions(self, logits: Tensor) -> list[Categorical]:
         """Make the distribution of each branch's action from the logits of all branches."""
@@ -696,10 +699,10 @@ class Gate(nn.Module):
 
     def forward(self, x: Tensor, y: Tensor) -> Tensor:
         """Merge x and y, (S, L, D) each."""
-        (reset_y, update_y, new_y), (reset_x, update_x) = self.from_y(y).chunk(3, -1), self.from_x(x).chunk(2, -1)
-        reset, update = torch.sigmoid(reset_y + reset_x), torch.sigmoid(update_y + update_x - self.bias)
-        new = torch.tanh(new_y + self.candidate(reset * x))
-        return torch.lerp(x, new.to(x.dtype), update.to(x.dtype))
+        (r_y, z_y, h_y), (r_x, z_x) = self.from_y(y).chunk(3, -1), self.from_x(x).chunk(2, -1)
+        r, z = torch.sigmoid(r_y + r_x), torch.sigmoid(z_y + z_x - self.bias)
+        h = torch.tanh(h_y + self.candidate(r * x))
+        return torch.lerp(x, h.to(x.dtype), z.to(x.dtype))  # (1 - z) x + z h
 
 
 class Block(nn.Module):
@@ -903,8 +906,8 @@ class Memory(nn.Module):
         row, env = self.window + first // pieces.num_envs, first % pieces.num_envs  # (S, 1) of a segment's first step
         columns = pieces.columns()  # (L,)
         episode_step = state.item_steps[(row + columns).clamp(max=last_row), env].where(pieces.is_step(), 0)  # (S, L)
-        before = self.reach(episode_step[:, 0])  # items from before the segment: later queries see no earlier ones
-        item_columns = torch.arange(-before, len(columns) - 1)  # (M,)
+        back = self.reach(episode_step[:, 0])  # items from before the segment: later queries see no earlier ones
+        item_columns = torch.arange(-back, len(columns) - 1)  # (M,)
         rows = (row + item_columns).clamp(max=last_row)  # (S, M)
         item_steps = state.item_steps[rows, env].to(device)  # (S, M)
         items = state.items[rows.to(device), env.to(device)]  # (S, M, K or K + 1, D)
@@ -912,16 +915,16 @@ class Memory(nn.Module):
         age = (columns[:, None] - item_columns).to(device)  # (L, M)
         episode_step = episode_step.to(device)
         seen = visible(age, episode_step[..., None], self.window)  # (S, L, M)
-        used = seen.any(1)  # (S, M); what no query sees becomes zero, so that not even a NaN in it has an effect
-        items, item_steps = items.masked_fill(~used[..., None, None], 0.0), item_steps.where(used, 0)
+        seen_by_any = seen.any(1)  # (S, M); what no query sees becomes zero, so that not even a NaN in it has an effect
+        items, item_steps = items.masked_fill(~seen_by_any[..., None, None], 0.0), item_steps.where(seen_by_any, 0)
         position = self.position(item_steps, x.dtype)  # (S, M, D)
-        step_before = items[:, before - 1 :]  # (S, L, K or K + 1, D): columns -1 .. L - 2
-        added_to_query = self.added_to_query(episode_step, step_before, x.dtype)
+        previous_items = items[:, back - 1 :]  # (S, L, K or K + 1, D): columns -1 .. L - 2
+        added_to_query = self.added_to_query(episode_step, previous_items, x.dtype)
         for k, block in enumerate(self.blocks):
             block_items = items[:, :, k]
             if self.memory_gradient:
-                own = x[:, :-1].masked_fill(~used[:, before:, None], 0.0)
-                block_items = torch.cat([block_items[:, :before], own], 1)
+                own = x[:, :-1].masked_fill(~seen_by_any[:, back:, None], 0.0)
+                block_items = torch.cat([block_items[:, :back], own], 1)
             keys_values = block.keys_values(block_items + position)
             x = block(x, added_to_query if k == 0 else 0.0, keys_values, age, seen)
         return pieces.unpad(x)
@@ -934,7 +937,7 @@ class Memory(nn.Module):
         """Return what is added to items (..., D) that were stored at these steps of their episodes."""
         return self.encode_step(episode_step, dtype) if self.encoding in ("absolute", "learned") else 0.0
 
-    def added_to_query(self, episode_step: Tensor, items_before: Tensor, dtype: torch.dtype) -> Tensor | float:
+    def added_to_query(self, episode_step: Tensor, previous_items: Tensor, dtype: torch.dtype) -> Tensor | float:
         """Return what is added to the first block's query (S, L, D) at these steps (S, L) of their episodes (§7.1.3).
 
         With --trxl-query-position the encoding of the step; with --trxl-query-output a projection of the last block's
@@ -942,8 +945,8 @@ class Memory(nn.Module):
         """
         added = self.encode_step(episode_step, dtype) if self.query_position else 0.0
         if self.query_output is not None:
-            output_before = items_before[..., -1, :].masked_fill(episode_step[..., None] == 0, 0.0)
-            added = added + self.query_output(output_before)
+            previous_output = previous_items[..., -1, :].masked_fill(episode_step[..., None] == 0, 0.0)
+            added = added + self.query_output(previous_output)
         return added
 
     def check_length(self, episode_step: Tensor) -> None:
@@ -995,14 +998,13 @@ class Agent(nn.Module):
         return self.heads(x)[1]
 
     def evaluate_actions(
-        self, observations: "UniqueObservations", actions: Tensor, pieces: Pieces, state: MemoryState
+        self, x: Tensor, actions: Tensor, pieces: Pieces, state: MemoryState
     ) -> tuple[list[Categorical], Tensor, Tensor, Tensor]:
         """Recompute, with gradient, what `get_action_and_value` computed at the steps of the pieces.
 
-        Returns the policy, a distribution of B actions for each branch, the log-probabilities (B, A) of the actions
-        (B, A), values (B,) and features (B, F).
+        x: the steps' encoded observations (B, I). Returns the policy, a distribution of B actions for each branch, the
+        log-probabilities (B, A) of the actions (B, A), values (B,) and features (B, F).
         """
-        x = observations.encode(self.encoder, pieces.flat_index())  # (B, I); section 9: on a CPU, equal ones once
         logits, values, features = self.heads(self.memory.unroll(x, pieces, state))
         policy = self.heads.distributions(logits)
         return policy, log_probs_of(policy, actions), values, features
@@ -1126,8 +1128,9 @@ def ppo_loss(
         return stored.flatten(0, 1).index_select(0, index)  # (T, N, ...) to (B, ...)
 
     with autocast(args, index.device):
+        x = observations.encode(agent.encoder, index)  # (B, I); section 9: on a CPU, equal ones once
         policy, log_probs, values, features = agent.evaluate_actions(
-            observations, gather(rollout.actions), minibatch, rollout.memory_state
+            x, gather(rollout.actions), minibatch, rollout.memory_state
         )
     log_ratio = log_probs - gather(rollout.log_probs)  # (B, A)
     advantages, old_values, returns = gather(rollout.advantages), gather(rollout.values), gather(rollout.returns)
@@ -1145,7 +1148,7 @@ def ppo_loss(
         logs["reconstruction_loss"] = reconstruction_loss(logits.float(), gather(rollout.obs[agent.encoder.images[0]]))
         loss = loss + args.reconstruction_coef * logs["reconstruction_loss"]
     if agent.estimator is not None:  # (5.6)
-        estimate = agent.estimator((features.detach() if args.ground_truth_detach else features).float())  # (B, G)
+        estimate = agent.estimator(features.detach() if args.ground_truth_detach else features)  # (B, G)
         logs["ground_truth_loss"] = F.mse_loss(estimate, gather(rollout.ground_truth))
         loss = loss + args.ground_truth_coef * logs["ground_truth_loss"]
     logs |= {"loss": loss, **policy_metrics(log_ratio, args.clip_coef)}
@@ -1173,7 +1176,7 @@ def update(
 ) -> dict[str, float]:
     """Learn from the rollout for some epochs; return what to log, averaged over the minibatches.
 
-    Raises FloatingPointError before a step that would spoil the weights.
+    Raises FloatingPointError if a loss or a gradient was not finite; the weights are of no use then.
     """
     if args.norm_adv == "batch":
         rollout.advantages = normalize(rollout.advantages)
@@ -1181,30 +1184,24 @@ def update(
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
     clipped_together = groups_to_clip(agent, args)
     logs = []
-    for epoch in range(args.update_epochs):
-        if args.refresh_memory and epoch > 0:
-            refresh_memory(agent, rollout, args)
-        for minibatch in pieces.minibatches(args.num_minibatches):
-            loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
-            if args.target_kl is not None and logs:  # before the first step, the policy is still the one that acted
-                kl = np.mean(all_gather(log["approx_kl"].item()))  # section 8: of all processes, which stop together
-                if kl > args.target_kl:
-                    break
-            optimizer.zero_grad()
-            loss.backward()
-            average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
-            norms = [nn.utils.clip_grad_norm_(group, args.max_grad_norm) for group in clipped_together]
-            log["grad_norm"] = norms[0]
-            if not torch.stack([log["loss"], *norms]).isfinite().all():
-                raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
-            optimizer.step()
-            logs.append(log)
-        else:
-            continue  # with the next epoch
-        break  # --target-kl was exceeded
+    for minibatch in minibatches_of_all_epochs(agent, rollout, pieces, args):
+        loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
+        if args.target_kl is not None and logs:  # before the first step, the policy is still the one that acted
+            kl = np.mean(all_gather(log["approx_kl"].item()))  # section 8: of all processes, which stop together
+            if kl > args.target_kl:
+                break
+        optimizer.zero_grad()
+        loss.backward()
+        average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
+        norms = [nn.utils.clip_grad_norm_(group, args.max_grad_norm) for group in clipped_together]
+        log |= {"grad_norm": norms[0], "largest_norm": torch.stack(norms).max()}
+        optimizer.step()
+        logs.append(log)
 
-    means = torch.stack([torch.stack([*log.values()]) for log in logs]).mean(0)  # over minibatches; asks a GPU once
-    losses = dict(zip(logs[0], means.tolist(), strict=True))
+    means = torch.stack([torch.stack([*log.values()]) for log in logs]).mean(0)  # over minibatches
+    losses = dict(zip(logs[0], means.tolist(), strict=True))  # asks a GPU once, for all minibatches
+    if not math.isfinite(losses["loss"] + losses.pop("largest_norm")):
+        raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
     # Before the first gradient step the weights are those that acted, so every ratio has to be 1.
     losses["ratio_error"] = logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
@@ -1213,14 +1210,22 @@ def update(
     return {f"losses/{k}": v for k, v in losses.items()} | {f"charts/{k}": v for k, v in charts.items()}
 
 
+def minibatches_of_all_epochs(agent: Agent, rollout: Rollout, pieces: Pieces, args: Args) -> Iterator[Pieces]:
+    """Yield the minibatches of one epoch after the other, all of a rollout's pieces in each."""
+    for epoch in range(args.update_epochs):
+        if args.refresh_memory and epoch > 0:
+            refresh_memory(agent, rollout, args)
+        yield from pieces.minibatches(args.num_minibatches)
+
+
 def groups_to_clip(agent: Agent, args: Args) -> list[list[nn.Parameter]]:
     """Return the parameters whose gradients are clipped together: the agent's first, then each detached head's.
 
     A detached head is a probe of what the features hold: if its gradient had a share of the norm, clipping would change
     the agent's step.
     """
-    heads = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
-    probes = [[*head.parameters()] for head, detached in heads if head is not None and detached]
+    auxiliary = ((agent.estimator, args.ground_truth_detach), (agent.decoder, args.reconstruction_detach))
+    probes = [[*network.parameters()] for network, detached in auxiliary if network is not None and detached]
     in_probes = {*itertools.chain(*probes)}
     return [[parameter for parameter in agent.parameters() if parameter not in in_probes], *probes]
 
@@ -1393,6 +1398,12 @@ def check_args(args: Args) -> None:
             raise ValueError(f"{flag(name)} is {value}; it must be below 2 ** 63")
     if not args.exp_name or set(args.exp_name) & set("/\\"):
         raise ValueError(f"--exp-name is {args.exp_name!r}; it must be a name without slashes")
+    for name in ("reconstruction", "ground_truth"):
+        if getattr(args, f"{name}_detach") and not getattr(args, f"{name}_coef"):
+            raise ValueError(f"{flag(f'{name}_detach')} needs {flag(f'{name}_coef')} above 0")
+    for name, (other, values) in NEEDS.items():
+        if getattr(args, name) != getattr(Args, name) and getattr(args, other) not in values:
+            raise ValueError(f"{flag(name)} needs {flag(other)} {' or '.join(values)}; without, it changes nothing")
     batch_size = args.num_envs * args.num_steps
     if args.total_timesteps < batch_size:
         raise ValueError(
@@ -1989,7 +2000,6 @@ def speed_up(agent: Agent, args: Args) -> None:
         images.forward = in_chunks(images.forward)
     if args.amp:
         agent.encoder.forward = pad_batch(agent.encoder.forward)
-        agent.heads.forward = pad_batch(agent.heads.forward)
 
 
 CHUNK = 256  # images; the backward pass of 2,048 at once takes about 1.5 times as long on a CPU, for its caches
@@ -2006,7 +2016,7 @@ def in_chunks(forward: Callable) -> Callable:
 
 
 def pad_batch(forward: Callable, multiple: int = 16) -> Callable:
-    """Return a function that computes with a batch padded to a multiple, and drops the padding again.
+    """Return a function of a dict of batches that pads them to a multiple, and drops the padding again.
 
     In bfloat16, a CPU's kernels are compiled for every batch size, which can take longer than running them.
     """
@@ -2014,10 +2024,8 @@ def pad_batch(forward: Callable, multiple: int = 16) -> Callable:
     def pad(x: Tensor) -> Tensor:
         return F.pad(x, [0, 0] * (x.dim() - 1) + [0, -len(x) % multiple])
 
-    def padded(x: Tensor | dict[str, Tensor]) -> Tensor | tuple[Tensor, ...]:
-        rows = len(next(iter(x.values())) if isinstance(x, dict) else x)
-        y = forward({name: pad(part) for name, part in x.items()} if isinstance(x, dict) else pad(x))
-        return tuple(part[:rows] for part in y) if isinstance(y, tuple) else y[:rows]
+    def padded(x: dict[str, Tensor]) -> Tensor:
+        return forward({name: pad(part) for name, part in x.items()})[: len(next(iter(x.values())))]
 
     return padded
 

@@ -41,7 +41,7 @@ def follow(folder):
 
 
 def test_the_memory_of_the_page(tmp_path):
-    assert (len(REPLACED), len(ADDED)) == (3, 5)
+    assert (len(REPLACED), len(ADDED)) == (4, 5)
     follow(tmp_path)
 
     def python(*command):

@@ -41,6 +41,10 @@ CASES = {
     "--exp-name ../up": "--exp-name is '../up'; it must be a name without slashes",
     "--env-id CueRecall-v0 --capture-video": "needs an environment that draws pictures .*; CueRecall-v0 draws none",
     "--target-kl nan": "--target-kl is nan; it must be above 0",
+    "--ground-truth-detach": "--ground-truth-detach needs --ground-truth-coef above 0",
+    "--memory none --seq-len 5": "--seq-len needs --memory gru or lstm; without, it changes nothing",
+    "--memory none --refresh-memory": "--refresh-memory needs --memory gru or lstm",
+    "--env-id .foo:x-v0": "the module of .foo:x-v0 begins with a dot",
     "--capture-video --load-model missing.pt": "there is no file missing.pt",
     "--load-model missing.pt": "there is no file missing.pt; --save-model writes model.pt",
 }
@@ -51,6 +55,8 @@ TRANSFORMER_CASES = {
     "--trxl-dim 9 --trxl-num-heads 3": "--trxl-dim is 9; it must be even",
     "--trxl-memory-length 0": "--trxl-memory-length is 0; it must be 1 or more",
     "--trxl-gate-bias inf": "--trxl-gate-bias is inf; it must be a finite number",
+    "--trxl-gate-bias 2": "--trxl-gate-bias needs --trxl-gate gru; without, it changes nothing",
+    "--trxl-pe-length 300": "--trxl-pe-length needs --trxl-positional-encoding learned",
     "--num-minibatches 200": "may have only 128 sequences .* at most that many, or more environments",
 }
 

@@ -43,8 +43,9 @@ def recompute(run):
     rollout = run.rollout
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
     index = pieces.flat_index()
-    observations, actions = ppo_gru.UniqueObservations(rollout.obs, run.agent), rollout.actions.flatten(0, 1)[index]
-    _, log_probs, values, _ = run.agent.evaluate_actions(observations, actions, pieces, rollout.memory_state)
+    x = run.agent.encoder({name: part.flatten(0, 1)[index] for name, part in rollout.obs.items()})
+    actions = rollout.actions.flatten(0, 1)[index]
+    _, log_probs, values, _ = run.agent.evaluate_actions(x, actions, pieces, rollout.memory_state)
     return index, (log_probs - rollout.log_probs.flatten(0, 1)[index]).exp(), values
 
 

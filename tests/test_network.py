@@ -100,14 +100,22 @@ def test_rows_are_rounded_up_in_bfloat16_and_change_nothing():
     for rows in (5, 16):
         agent.zero_grad()
         with torch.autocast("cpu", torch.bfloat16):
-            logits, values, features = agent.heads(agent.encoder({"observation": pixels[:rows]}))
-        assert [len(part) for part in (logits, values, features)] == [rows, rows, rows]
-        parts = [part[:5] for part in (logits, values, features)]
-        sum(part.float().square().sum() for part in parts).backward()
-        gradients = [parameter.grad for name, parameter in agent.named_parameters() if "memory" not in name]
-        found.append([*parts, *gradients])
+            x = agent.encoder({"observation": pixels[:rows]})
+        assert len(x) == rows
+        x[:5].square().sum().backward()
+        found.append([x[:5], *(parameter.grad for parameter in agent.encoder.parameters())])
     assert taken == [16, 16]
     for got, want in zip(*found, strict=True):
+        torch.testing.assert_close(got, want, rtol=0, atol=0)
+
+
+def test_heads_compute_in_float32_with_amp():
+    torch.manual_seed(0)
+    agent, x = Agent(PIXELS, [4], Args(hidden_size=32, head_size=32)), torch.randn(5, 32)
+    wanted = agent.heads(x)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = agent.heads(x)
+    for got, want in zip(found, wanted, strict=True):
         torch.testing.assert_close(got, want, rtol=0, atol=0)
 
 
