@@ -129,6 +129,10 @@ CLAIMS = {
     "samples-mortar-mayhem": Claim(
         "6.2.2", "TrXL takes fewer samples than GRU in Mortar Mayhem Grid", MORTAR_MAYHEM, ("TrXL",), ("GRU",), area
     ),
+    "samples-small-values": Claim(
+        "6.2.2", "the same, with fresh values near 0 (`--value-init-gain 0.01`)", MORTAR_MAYHEM,
+        ("TrXL --value-init-gain 0.01",), ("GRU --value-init-gain 0.01",), area,
+    ),
     "samples-mystery-path": Claim(
         "6.2.2", "TrXL takes fewer samples than GRU in Mystery Path Grid", MYSTERY_PATH, ("TrXL",), ("GRU",), area
     ),
