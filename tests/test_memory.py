@@ -279,9 +279,9 @@ def test_truncation_bootstraps_with_the_final_observation_and_the_memory_before_
     assert not rollout.terminated.any()
     assert (rollout.truncation_values != 0).equal(rollout.truncated)
     # The same actions played again: the final observation, and the memory that five steps left behind.
-    state, options = run.agent.memory.initial_state(4, 16, torch.device("cpu")), {"max_steps": 5}
-    envs = ppo_gru.environments(args, args.num_envs, seed=args.seed, options=options)
-    envs.reset(options=options)
+    state = run.agent.memory.initial_state(4, 16, torch.device("cpu"))
+    envs = ppo_gru.environments(args, args.num_envs, seed=args.seed)
+    envs.reset()
     with torch.no_grad():
         for t in range(5):
             *_, state = run.agent.get_action_and_value({"observation": rollout.obs["observation"][t]}, state)
