@@ -1007,12 +1007,11 @@ class SearingSpotlights(MemoryGymVectorEnv):
     for the next spotlight is always the first of the planned intervals, as the last is what a spawn removes; so
     spawn_interval_decay changes nothing, and neither does reward_max_steps. All coins but the first are a step old when
     they are first shown, so in the dark they are seen in one frame less than `coin_show_duration` says. Radii of
-    spotlights are whole pixels, from
-    spot_min_radius to spot_max_radius, both rounded down. The agent may start under the bar or outside the screen and
-    steps inside with its first step; before that it is drawn facing up, and no spotlight shines. Dying at the exit is
-    no success, though it pays. An endless task's coin may appear on the agent. Small coins (scale below 0.5) are all
-    rim and small exits all frame. What is visible in the dark is drawn above the bar or below it, depending on what
-    else is.
+    spotlights are whole pixels, from spot_min_radius to spot_max_radius, both rounded down. The agent may start under
+    the bar or outside the screen and steps inside with its first step; before that it is drawn facing up, and no
+    spotlight shines. Dying at the exit is no success, though it pays. An endless task's coin may appear on the agent.
+    Small coins (scale below 0.5) are all rim and small exits all frame. What is visible in the dark is drawn above the
+    bar or below it, depending on what else is.
     Differences from the original: images are rows first; max_steps truncates; the finite id reports ground truth;
         nothing that an episode drew or painted black or white shows in the next; no exit, no coins and a hidden action
         bar work; coins for which no free pixel is left are put anywhere; a smallest radius or speed above the largest
