@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, befo
 import memory_gym_envs  # noqa: F401 (registers the ids)
 from memory_gym_envs.character import FACINGS, PAD, agent_tables, free_controls, grid_controls, walk
 from memory_gym_envs.drawing import SCREEN
-from memory_gym_envs.mystery_path import BEYOND, MAP_STRIDES, PIT, TILE_AT
+from memory_gym_envs.mystery_path import MAP_STRIDES, PIT, PIT_ROWS, TILE_AT
 
 THESIS = {  # mean, standard deviation, minimum, maximum, levels
     "SearingSpotlights-v0": (33.36, 7.56, 14, 63, 100_000),
@@ -66,10 +66,10 @@ def fewest_steps(envs: gym.vector.VectorEnv) -> np.ndarray:
         front[:], steps = False, steps + 1
         for action in range(controls.actions - 1):
             turned, pos = walk(facing, np.stack(place, axis=1) + PAD, action, 0, controls, table)
-            step = s.step_at[lane, TILE_AT[pos] @ MAP_STRIDES + BEYOND]
+            step = s.step_at[lane, TILE_AT[pos] @ MAP_STRIDES + PIT_ROWS]
             safe = step != PIT
             front[(lane[safe], turned[safe] * grid, *(pos[safe].T - PAD))] = True
-            fewest[lane[step == s.count[lane]]] = steps
+            fewest[lane[step == s.path_length[lane]]] = steps
         front &= ~seen
         seen |= front
         front[fewest > 0] = False

@@ -28,12 +28,12 @@ NOTHING = np.zeros((0, 0), bool)
 class Stencils(NamedTuple):
     """Square shapes at every place, which is the corner of their four middle pixels.
 
-    A picture of one is a window on a long tape, on which it stands between dark rows, once for every x. The arrays
+    A picture of one is a window on a long strip, on which it stands between dark rows, once for every x. The arrays
     (K * PLACES,) are looked up by shape * PLACES + PLACE_0 + x, or y.
     """
 
-    windows: np.ndarray  # (rows,) by their first row on the tape: one opaque item each
-    column: np.ndarray  # where on the tape the shape starts, for every x
+    windows: np.ndarray  # (rows,) by their first row on the strip: one opaque item each
+    column: np.ndarray  # where on the strip the shape starts, for every x
     row: np.ndarray  # how far from there the window starts, for every y
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -55,22 +55,22 @@ def _stencils(shapes: Sequence[np.ndarray], pack: Callable, step: int, height: i
     places = np.arange(PLACES) - PLACE_0
     width = np.array([len(shape) for shape in shapes])[:, None]  # (K, 1)
     first = places - width // 2  # (K, PLACES) the shape's first row or column
-    # A sample has every second row of a shape, these or those: every x has a part of the tape for either.
+    # A sample has every second row of a shape, these or those: every x has a part of the strip for either.
     part, phase = width // step + height, -first % step
     row = (-first // step).clip(-height, width // step) + part * phase
     column, end = np.full(first.shape, height), 2 * height + step * int(part.max())
-    tape = [pack(np.zeros((end, SCREEN), bool))]  # a window that starts in its row `height` is dark whatever the y
+    strip = [pack(np.zeros((end, SCREEN), bool))]  # a window that starts in its row `height` is dark whatever the y
     for index, shape in enumerate(shapes):
         if shape.size:
             seen = (first[index] < SCREEN) & (first[index] > -len(shape))
             column[index, seen] = end + step * part[index] * (first[index, seen] + len(shape) - 1)
-            tape.append(_every_x(shape, pack, step, height))
-            end += len(tape[-1])
-    return Stencils(windows(np.concatenate(tape), height), column.reshape(-1), row.reshape(-1))
+            strip.append(_every_x(shape, pack, step, height))
+            end += len(strip[-1])
+    return Stencils(windows(np.concatenate(strip), height), column.reshape(-1), row.reshape(-1))
 
 
 def _every_x(shape: np.ndarray, pack: Callable, step: int, height: int) -> np.ndarray:
-    """Rows of a tape: a (W, W) mask at every x where any of it is on the screen, each part before dark rows."""
+    """Rows of a strip: a (W, W) mask at every x where any of it is on the screen, each part before dark rows."""
     wide = np.pad(shape, ((0, 0), (SCREEN - 1, SCREEN - 1)))
     cut = np.lib.stride_tricks.sliding_window_view(wide, SCREEN, axis=1)[:, ::-1]  # (W, X, 84), from left to right
     bits = pack(cut)  # (W, X, items)
@@ -102,10 +102,10 @@ def _sampled(pixels: np.ndarray) -> np.ndarray:
     return words_.view(np.uint64)
 
 
-def windows(tape: np.ndarray, height: int) -> np.ndarray:
-    """Every window of so many rows of a tape (rows, items), by its first row: one opaque item each, a view."""
-    size = tape.shape[1] * tape.itemsize
-    return np.ndarray((len(tape) - height + 1,), np.dtype(f"V{size * height}"), tape, 0, (size,))
+def windows(strip: np.ndarray, height: int) -> np.ndarray:
+    """Every window of so many rows of a strip (rows, items), by its first row: one opaque item each, a view."""
+    size = strip.shape[1] * strip.itemsize
+    return np.ndarray((len(strip) - height + 1,), np.dtype(f"V{size * height}"), strip, 0, (size,))
 
 
 def as_words(views: np.ndarray) -> np.ndarray:

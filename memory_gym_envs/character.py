@@ -139,10 +139,10 @@ class AgentTables(NamedTuple):
 def agent_tables(figures: tuple[Figure, ...]) -> AgentTables:
     """The tables of the given figures. Cached: environments with the same options share them."""
     walk = np.concatenate([walk_table(figure) for figure in figures])
-    looks = [sprites(figure.scale) for figure in figures]
-    width = min(SCREEN, max(solid.shape[1] for _, solid in looks))
+    pictures = [sprites(figure.scale) for figure in figures]
+    width = min(SCREEN, max(solid.shape[1] for _, solid in pictures))
     images, solids = [], []
-    for image, solid in looks:
+    for image, solid in pictures:
         margin = (width - solid.shape[1]) // 2
         around = ((0, 0), (margin, margin), (margin, margin))
         images.append(np.pad(image, (*around, (0, 0))))

@@ -11,6 +11,15 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from memory_gym_envs.appearance import (
+    LARGEST_RADIUS,
+    AppearanceTables,
+    View,
+    agent_entries,
+    covered,
+    make_appearance_tables,
+    write_agent_entries,
+)
 from memory_gym_envs.base import ALL, DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, numbered, widened
 from memory_gym_envs.character import (
     FACINGS,
@@ -27,7 +36,6 @@ from memory_gym_envs.character import (
 )
 from memory_gym_envs.drawing import ROW, SCREEN, Sheet, paste, ring, turned_45
 from memory_gym_envs.entries import Entries, vector_slices
-from memory_gym_envs.looks import LARGEST, Looks, View, agent_entries, covered, look, make_looks
 from memory_gym_envs.options import Option
 from memory_gym_envs.words import below, pick, words
 
@@ -90,7 +98,7 @@ def _entries(clue: bool, endless: bool) -> tuple[Entries, ...]:
     """What a vector observation of an id is made of."""
     command = f"the command that is shown, one-hot: {', '.join(COMMANDS)}; zeros: none"
     rest = f"the commands, as in vector_observation: {VECTOR_COMMANDS} by 9 one-hot, {', '.join(VECTOR_ORDER)}"
-    around = LARGEST // 2 + 1 if endless else 0  # how far beyond the screen's edge an agent may be
+    around = LARGEST_RADIUS // 2 + 1 if endless else 0  # how far beyond the screen's edge an agent may be
     return (
         *agent_entries(-around, SCREEN + around),
         Entries("arena", 1, f"tiles along one side of the arena, / {SIZES[-1]}; 0: an agent hides all of it"),
@@ -125,31 +133,31 @@ class State:
     facing: np.ndarray  # (N,)
     figure: np.ndarray  # (N,) which of the batch's figures the agent is
     size: np.ndarray  # (N,) tiles along one side
-    blue: np.ndarray  # (N,) picture of the arena when nothing burns, a row of floors()
+    calm_floor: np.ndarray  # (N,) picture of the arena when nothing burns, a row of floors()
     floor: np.ndarray  # (N,) picture of the arena now
     target: np.ndarray  # (N,) the tile to reach
-    goal: np.ndarray  # (N, 2) the first pixel of that tile, with PAD
+    target_corner: np.ndarray  # (N, 2) the first pixel of that tile, with PAD
     truth: np.ndarray  # (N, 2) float64: that tile, divided by arena size - 1
     commands: np.ndarray  # (N, C)
     count: np.ndarray  # (N,) length of the sequence
     current: np.ndarray  # (N,) commands checked so far, in this round of the sequence
     completed: np.ndarray  # (N,) commands carried out so far, in the episode
     clue: np.ndarray  # (N, L) uint8: what is shown at each step of the clue; BLANK at its end and after
-    clue_at: np.ndarray  # (N,) the step that is being shown
+    clue_step: np.ndarray  # (N,) the step that is being shown
     clue_end: np.ndarray  # (N,) the first step without a clue, where the agent may act
     symbol: np.ndarray  # (N,) what the frame shows: BLANK or 1 + command
     timer: np.ndarray  # (N,) acting steps until the tiles are lit or put out
-    lit: np.ndarray  # (N,) bool: all tiles but the target burn
-    fuse: np.ndarray  # (N,) this episode's explosion_delay
-    burn: np.ndarray  # (N,) this episode's explosion_duration
-    show: np.ndarray  # (N,) this episode's command_show_duration
-    gap: np.ndarray  # (N,) this episode's command_show_delay
+    burning: np.ndarray  # (N,) bool: all tiles but the target burn
+    explosion_delay: np.ndarray  # (N,) this episode's explosion_delay
+    explosion_duration: np.ndarray  # (N,) this episode's explosion_duration
+    show_duration: np.ndarray  # (N,) this episode's command_show_duration
+    show_delay: np.ndarray  # (N,) this episode's command_show_delay
     length: np.ndarray  # (N,) steps so far
-    returned: np.ndarray  # (N,) float64: sum of rewards so far
+    episode_return: np.ndarray  # (N,) float64: sum of rewards so far
     vector: np.ndarray  # (N, 180) float32: the commands as one-hot rows
     # Options that the rules need at every step.
-    feedback: np.ndarray  # (N,) bool
-    limit: np.ndarray  # (N,) steps until truncation
+    visual_feedback: np.ndarray  # (N,) bool
+    step_limit: np.ndarray  # (N,) steps until truncation
     reward_success: np.ndarray  # (N,) float64
     reward_failure: np.ndarray  # (N,) float64
     reward_episode: np.ndarray  # (N,) float64
@@ -157,10 +165,11 @@ class State:
 
 def empty_state(lanes: int) -> State:
     """The state of N lanes before their first reset."""
-    shapes = {"pos": (2,), "goal": (2,), "truth": (2,), "commands": (1,), "clue": (1,)}
+    shapes = {"pos": (2,), "target_corner": (2,), "truth": (2,), "commands": (1,), "clue": (1,)}
     shapes["vector"] = (VECTOR_COMMANDS * len(COMMANDS),)
-    kinds = {"lit": bool, "feedback": bool, "clue": np.uint8, "vector": np.float32}
-    kinds |= dict.fromkeys(("truth", "returned", "reward_success", "reward_failure", "reward_episode"), np.float64)
+    kinds = {"burning": bool, "visual_feedback": bool, "clue": np.uint8, "vector": np.float32}
+    rewards = ("reward_success", "reward_failure", "reward_episode")
+    kinds |= dict.fromkeys(("truth", "episode_return", *rewards), np.float64)
     names = State.__dataclass_fields__
     return State(**{name: np.zeros((lanes, *shapes.get(name, ())), kinds.get(name, np.int64)) for name in names})
 
@@ -174,10 +183,10 @@ class Level(NamedTuple):
     tile: int  # column * arena size + row
     offset: tuple[int, int]
     commands: list[int]
-    show: int
-    gap: int
-    burn: int
-    fuse: int
+    show_duration: int
+    show_delay: int
+    explosion_duration: int
+    explosion_delay: int
 
 
 def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
@@ -225,21 +234,22 @@ def _valid_commands(size: int, kinds: int) -> list[list[tuple[int, int]]]:
 
 def write_level(s: State, lane: int, level: Level, variant: Variant) -> None:
     """Starts the lane's episode at this level."""
-    count, tiles, start = len(level.commands), tile_tables(), int(s.blue[lane]) + 1 + level.tile
+    count, tiles, start = len(level.commands), tile_tables(), int(s.calm_floor[lane]) + 1 + level.tile
     s.pos[lane] = tiles.corner[start] + TILE // 2
     if variant.jitter:
         s.pos[lane] += level.offset
-    aim(s, lane, tiles.next[start, level.commands[0]])
-    s.facing[lane] = s.current[lane] = s.completed[lane] = s.length[lane] = s.returned[lane] = 0
-    s.lit[lane] = False
-    s.floor[lane] = s.blue[lane]
+    set_target(s, lane, tiles.next[start, level.commands[0]])
+    s.facing[lane] = s.current[lane] = s.completed[lane] = s.length[lane] = s.episode_return[lane] = 0
+    s.burning[lane] = False
+    s.floor[lane] = s.calm_floor[lane]
     s.count[lane] = count
     s.commands[lane, :count] = level.commands
-    s.fuse[lane], s.burn[lane], s.show[lane], s.gap[lane] = level.fuse, level.burn, level.show, level.gap
-    s.timer[lane] = level.fuse + 1  # the first command has a step more than the others
+    s.explosion_delay[lane], s.explosion_duration[lane] = level.explosion_delay, level.explosion_duration
+    s.show_duration[lane], s.show_delay[lane] = level.show_duration, level.show_delay
+    s.timer[lane] = level.explosion_delay + 1  # the first command has a step more than the others
     if variant.clue:
         write_clue(s, lane, level.commands)
-        s.clue_at[lane] = 0
+        s.clue_step[lane] = 0
         s.symbol[lane] = s.clue[lane, 0]
     else:
         row = s.vector[lane]  # (180,)
@@ -250,8 +260,8 @@ def write_level(s: State, lane: int, level: Level, variant: Variant) -> None:
 
 def write_clue(s: State, lane: int, commands: list[int]) -> None:
     """Plans what the lane sees at each step of a clue: every command for a while, then nothing for a while."""
-    show = int(s.show[lane])
-    period = show + int(s.gap[lane])
+    show = int(s.show_duration[lane])
+    period = show + int(s.show_delay[lane])
     end = period * len(commands)
     plan = s.clue[lane]  # (L,)
     plan[: end + 1] = BLANK
@@ -372,7 +382,7 @@ def symbol_masks() -> np.ndarray:
 
 
 @lru_cache(maxsize=16)
-def looks(figures: tuple[Figure, ...], clue: bool) -> Looks:
+def appearance_tables(figures: tuple[Figure, ...], clue: bool) -> AppearanceTables:
     """What can be seen of these figures behind every symbol, where symbols are shown."""
     views = []
     for figure in figures:
@@ -381,23 +391,25 @@ def looks(figures: tuple[Figure, ...], clue: bool) -> Looks:
         image, solid = sprites(figure.scale)
         free = ~symbol_masks() if clue else ~symbol_masks()[:1]
         views += [View(figure.scale, image, solid, each, reach, reach) for each in free]
-    return make_looks(views)
+    return make_appearance_tables(views)
 
 
-def hide_floor(out: np.ndarray, s: State, lanes: np.ndarray | slice, sprite: np.ndarray, looks: Looks) -> None:
+def hide_floor(
+    out: np.ndarray, s: State, lanes: np.ndarray | slice, sprite: np.ndarray, tables: AppearanceTables
+) -> None:
     """Clears the floor's entries (n, 4) of what large agents hide, in place.
 
     What shows is decided by some pixels alone, which no two floors have in common: the arena's corners and the tile's.
     """
     first, size = SCREEN // 2 - TILE * s.size[lanes] // 2 + PAD, s.size[lanes]
     arena = first[:, None, None] + CORNERS * (TILE * size - 1)[:, None, None]  # (n, 4, 2)
-    tile = s.goal[lanes][:, None] + CORNERS * (TILE - 1)  # (n, 4, 2)
+    tile = s.target_corner[lanes][:, None] + CORNERS * (TILE - 1)  # (n, 4, 2)
     points = np.concatenate([arena, tile], axis=1)  # (n, 8, 2)
     x, y = np.moveaxis(points - PAD, -1, 0)
-    shown = ~covered(looks, sprite, s.pos[lanes], points) & ~symbol_masks()[s.symbol[lanes][:, None], y, x]  # (n, 8)
-    burning = shown[:, :4] & (arena != tile).any(axis=-1)
+    shown = ~covered(tables, sprite, s.pos[lanes], points) & ~symbol_masks()[s.symbol[lanes][:, None], y, x]  # (n, 8)
+    shows_fire = shown[:, :4] & (arena != tile).any(axis=-1)
     out[:, 0] *= shown[:, :4].any(axis=1)
-    out[:, 1:] *= burning.any(axis=1)[:, None]
+    out[:, 1:] *= shows_fire.any(axis=1)[:, None]
     out[:, 2:] *= shown[:, 4:].any(axis=1)[:, None]
 
 
@@ -409,43 +421,43 @@ def show_clue(s: State, first_step: np.ndarray) -> np.ndarray:
 
     first_step: (N,) where each lane's plan starts in the flattened State.clue.
     """
-    s.clue_at += 1
-    np.minimum(s.clue_at, s.clue_end, out=s.clue_at)
-    s.symbol = s.clue.take(first_step + s.clue_at)
-    return s.clue_at == s.clue_end
+    s.clue_step += 1
+    np.minimum(s.clue_step, s.clue_end, out=s.clue_step)
+    s.symbol = s.clue.take(first_step + s.clue_step)
+    return s.clue_step == s.clue_end
 
 
 def on_target(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     """(n,) bool: whose centre is on its target tile."""
     # Places before the tile are negative, which is huge as an unsigned number.
-    ahead = (s.pos[lanes] - s.goal[lanes]).view(np.uint64) < TILE  # (n, 2)
+    ahead = (s.pos[lanes] - s.target_corner[lanes]).view(np.uint64) < TILE  # (n, 2)
     return ahead[:, 0] & ahead[:, 1]
 
 
-def light(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def ignite_tiles(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sets all tiles but the target on fire: who carried the command out, and whose sequence is through, both (n,)."""
     s.current[lanes] += 1
-    s.lit[lanes] = True
-    s.timer[lanes] = s.burn[lanes]
-    seen = lanes[s.feedback[lanes]]
+    s.burning[lanes] = True
+    s.timer[lanes] = s.explosion_duration[lanes]
+    seen = lanes[s.visual_feedback[lanes]]
     s.floor[seen] = s.target[seen]
     hit = on_target(s, lanes)
     s.completed[lanes] += hit
     return hit, s.current[lanes] >= s.count[lanes]
 
 
-def put_out(s: State, lanes: np.ndarray) -> None:
+def extinguish_tiles(s: State, lanes: np.ndarray) -> None:
     """Puts the fire out and moves the target on by the next command."""
-    s.floor[lanes] = s.blue[lanes]
-    s.lit[lanes] = False
-    s.timer[lanes] = s.fuse[lanes]
-    aim(s, lanes, tile_tables().next[s.target[lanes], s.commands[lanes, s.current[lanes]]])
+    s.floor[lanes] = s.calm_floor[lanes]
+    s.burning[lanes] = False
+    s.timer[lanes] = s.explosion_delay[lanes]
+    set_target(s, lanes, tile_tables().next[s.target[lanes], s.commands[lanes, s.current[lanes]]])
 
 
-def aim(s: State, lanes: np.ndarray | int, tile: np.ndarray | int) -> None:
+def set_target(s: State, lanes: np.ndarray | int, tile: np.ndarray | int) -> None:
     """Makes these tiles the targets of the lanes."""
     s.target[lanes] = tile
-    s.goal[lanes] = tile_tables().corner[tile]
+    s.target_corner[lanes] = tile_tables().corner[tile]
     s.truth[lanes] = tile_tables().truth[tile]
 
 
@@ -493,7 +505,7 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     variants = VARIANTS
     growing = ("commands", "clue")
-    tables = (*MemoryGymVectorEnv.tables, "_looks")
+    tables = (*MemoryGymVectorEnv.tables, "_appearance")
     kept = (*MemoryGymVectorEnv.kept, "_clues_open")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
@@ -515,13 +527,13 @@ class MortarMayhem(MemoryGymVectorEnv):
         """Takes over the options of the lanes, and the tables that all lanes' options need."""
         s, variant, values = self.state, self.variant, self.settings[int(lanes[0])]
         s.size[lanes] = values.get("arena_size", TORUS_SIZE)
-        s.blue[lanes] = FLOORS.index((values.get("arena_size", TORUS_SIZE), None))
-        s.feedback[lanes] = values["visual_feedback"]
+        s.calm_floor[lanes] = FLOORS.index((values.get("arena_size", TORUS_SIZE), None))
+        s.visual_feedback[lanes] = values["visual_feedback"]
         s.reward_success[lanes] = values["reward_command_success"]
         s.reward_failure[lanes] = values["reward_command_failure"]
         s.reward_episode[lanes] = values.get("reward_episode_success", 0.0)
         limit = values.get("max_steps", -1)
-        s.limit[lanes] = NO_LIMIT if limit == -1 else limit
+        s.step_limit[lanes] = NO_LIMIT if limit == -1 else limit
         count = values["initial_command_count"] if variant.endless else max(values["command_count"])
         s.commands = widened(s.commands, count + 1)
         if variant.clue:
@@ -545,7 +557,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
         self._lane_clue = np.arange(self.num_envs) * self.state.clue.shape[1]  # (N,)
         if self.obs_type == "vector":
-            self._looks = looks(self.figures, self.variant.clue)
+            self._appearance = appearance_tables(self.figures, self.variant.clue)
             views = len(symbols()) if self.variant.clue else 1
             self._lane_sprites = self.state.figure * (views * FACINGS)  # (N,)
             self._at = vector_slices(self.variant.entries)
@@ -571,14 +583,14 @@ class MortarMayhem(MemoryGymVectorEnv):
             due = s.timer == 0  # only a lane that acts gets there
             if np.count_nonzero(due):
                 self._change_tiles(due.nonzero()[0], rewards, terminated)
-            burning = s.lit & acting
-            if np.count_nonzero(burning):
-                fallen = burning & ~on_target(s, ALL)
+            in_danger = s.burning & acting
+            if np.count_nonzero(in_danger):
+                failed = in_danger & ~on_target(s, ALL)
                 # Not added: the original overwrites whatever this step had earned.
-                np.copyto(rewards, s.reward_failure, where=fallen)
-                terminated |= fallen
-            s.returned += rewards
-        truncated = (s.length == s.limit) & ~terminated if variant.endless else np.zeros(self.num_envs, bool)
+                np.copyto(rewards, s.reward_failure, where=failed)
+                terminated |= failed
+            s.episode_return += rewards
+        truncated = (s.length == s.step_limit) & ~terminated if variant.endless else np.zeros(self.num_envs, bool)
         return rewards, terminated, truncated
 
     def _acting_lanes(self) -> np.ndarray:
@@ -599,22 +611,22 @@ class MortarMayhem(MemoryGymVectorEnv):
     def _change_tiles(self, lanes: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
         """Lights the lanes' tiles and checks their command, or puts the tiles out."""
         s = self.state
-        burnt_out = s.lit[lanes]
+        burnt_out = s.burning[lanes]
         if np.count_nonzero(burnt_out):
-            put_out(s, lanes[burnt_out])
+            extinguish_tiles(s, lanes[burnt_out])
             lanes = lanes[~burnt_out]
         if lanes.size:
-            hit, through = light(s, lanes)
+            hit, through = ignite_tiles(s, lanes)
             rewards[lanes] = s.reward_success[lanes] * hit
             if self.variant.endless:
                 for lane in lanes[through].tolist():
-                    self._grow(lane)
+                    self._extend_sequence(lane)
             else:
                 # Whether or not the last command was carried out, as in the original; a failure overwrites the reward.
                 rewards[lanes] += s.reward_episode[lanes] * through
                 terminated[lanes] = through
 
-    def _grow(self, lane: int) -> None:
+    def _extend_sequence(self, lane: int) -> None:
         """Appends a command to the lane's completed sequence and shows it from the next step on."""
         s = self.state
         command = below(words(self._rngs[lane]), self.settings[lane]["allowed_commands"])
@@ -624,7 +636,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         s.commands[lane, length] = command
         s.count[lane], s.current[lane] = length + 1, 0
         write_clue(s, lane, [command])
-        s.clue_at[lane] = -1
+        s.clue_step[lane] = -1
         self._clues_open = True
 
     def pixels(self, lanes: np.ndarray | slice) -> Any:
@@ -645,11 +657,11 @@ class MortarMayhem(MemoryGymVectorEnv):
             out[:, at["command"]] = COMMAND_ENTRIES.take(symbol, axis=0)
         else:
             out[:, at["commands"]] = s.vector[lanes]
-        look(out[:, at["size"].start : at["facing"].stop], self._looks, sprite, s.pos[lanes])
+        write_agent_entries(out[:, at["size"].start : at["facing"].stop], self._appearance, sprite, s.pos[lanes])
         floor = out[:, at["arena"].start : at["safe"].stop]
         floor[:] = floor_entries().take(s.floor[lanes], axis=0)
         if self._large:
-            hide_floor(floor, s, lanes, sprite, self._looks)
+            hide_floor(floor, s, lanes, sprite, self._appearance)
         return out
 
     def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
@@ -663,7 +675,7 @@ class MortarMayhem(MemoryGymVectorEnv):
     def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
         """The lanes' ended episodes in numbers."""
         s = self.state
-        numbers = {"reward": s.returned[lanes], "length": s.length[lanes]}
+        numbers = {"reward": s.episode_return[lanes], "length": s.length[lanes]}
         if self.variant.endless:
             return numbers | {"commands_completed": s.completed[lanes], "max_command_sequence": s.count[lanes] - 1}
         success = (s.current[lanes] >= s.count[lanes]).astype(np.int64)
@@ -672,5 +684,5 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Circles the target tile."""
-        x, y = ((self.state.goal[lane] - PAD) * DEBUG_ZOOM + TILE * DEBUG_ZOOM // 2).tolist()
+        x, y = ((self.state.target_corner[lane] - PAD) * DEBUG_ZOOM + TILE * DEBUG_ZOOM // 2).tolist()
         frame[ring(len(frame), x, y, TILE * DEBUG_ZOOM // 2, 2 * DEBUG_ZOOM)] = GREEN

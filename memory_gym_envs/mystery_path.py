@@ -11,6 +11,15 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from memory_gym_envs.appearance import (
+    LARGEST_RADIUS,
+    AppearanceTables,
+    View,
+    agent_entries,
+    covered,
+    make_appearance_tables,
+    write_agent_entries,
+)
 from memory_gym_envs.base import DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, numbered, widened
 from memory_gym_envs.character import (
     FACINGS,
@@ -27,32 +36,31 @@ from memory_gym_envs.character import (
 )
 from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, magnify, make_sheet, paste, stamp
 from memory_gym_envs.entries import Entries, vector_slices
-from memory_gym_envs.looks import LARGEST, Looks, View, agent_entries, covered, look, make_looks
 from memory_gym_envs.options import Option
-from memory_gym_envs.words import Tape, below, pick
+from memory_gym_envs.words import WordBuffer, below, pick
 
 TILE = 12  # pixels
 SIDE = 7  # tiles along one side of the screen, and of a segment of the endless path
 SEGMENT = SIDE + 1  # columns of a segment with the transition tile behind it
 FIRST_SEGMENTS = 3  # of an endless path; more are appended as the agent gets there
 
-# A cell of the map is column * ROWS + BEYOND + row, with rows of pit above and below the screen: in the endless id
+# A cell of the map is column * ROWS + PIT_ROWS + row, with rows of pit above and below the screen: in the endless id
 # nothing holds the agent back there, and the largest and fastest gets nine tiles out.
-BEYOND = 9
-ROWS = BEYOND + SIDE + BEYOND
+PIT_ROWS = 9
+ROWS = PIT_ROWS + SIDE + PIT_ROWS
 MAP_STRIDES = np.array([ROWS, 1])
 
 PIT = 0  # the step of the path at places that are none; the path's own steps count from 1, the origin
-NOWHERE = -1  # the cell of that step
-FAR = 14  # pixels: who walks further in a step can leave the stored positions
+NO_CELL = -1  # the cell of that step
+FAST = 14  # pixels: who walks further in a step can leave the stored positions
 NO_STEP = -1  # where an agent is while it is put back
 REACHED = -1  # of steps without a reward for reaching them first
 TILE_AT = (np.arange(SPAN) - PAD) // TILE  # of stored positions on the screen
 BRANCHES = np.array([3, 1])  # numbers the actions of two branches
 
 EAST, NORTH, SOUTH, WEST = range(4)
-HEADINGS = np.zeros(2 * ROWS + 1, np.int64)  # by the difference of two cells, counted from the end if negative
-HEADINGS[[ROWS, -1, 1, -ROWS]] = EAST, NORTH, SOUTH, WEST
+DIRECTIONS = np.zeros(2 * ROWS + 1, np.int64)  # by the difference of two cells, counted from the end if negative
+DIRECTIONS[[ROWS, -1, 1, -ROWS]] = EAST, NORTH, SOUTH, WEST
 
 
 # ---- configuration ----
@@ -105,7 +113,7 @@ def _entries(endless: bool) -> tuple[Entries, ...]:
             Entries(name, 2, f"the centre of the path's {name}, x and y, / 84 pixels; zeros: not shown, or hidden")
             for name in ("origin", "goal")
         ]
-        return *agent_entries(0, SCREEN + LARGEST), cross, *places
+        return *agent_entries(0, SCREEN + LARGEST_RADIUS), cross, *places
     past = (
         "1: a tile of the path behind the agent shows, by column and then row; its left edge is in one of 8 columns of "
         "12 pixels, the first of which is left of the screen"
@@ -142,32 +150,32 @@ class State:
     pos: np.ndarray  # (N, 2) the agent's centre, x and y; in the endless id x is counted along the path
     facing: np.ndarray  # (N,)
     figure: np.ndarray  # (N,) which of the batch's figures the agent is
-    scene: np.ndarray  # (N,) and which of its scenes it is in
+    view: np.ndarray  # (N,) and which of its view options it has
     origin: np.ndarray  # (N, 2) where the agent starts and is put back to
     tile: np.ndarray  # (N, 2) the agent's tile, column and row
-    step: np.ndarray  # (N,) the path's step at that tile, or PIT
-    at: np.ndarray  # (N,) the path's step where the agent last was on the path
-    heading: np.ndarray  # (N,) the direction of the tile after that
+    path_step: np.ndarray  # (N,) the path's step at that tile, or PIT
+    last_path_step: np.ndarray  # (N,) the path's step where the agent last was on the path
+    next_direction: np.ndarray  # (N,) the direction of the tile after that
     fallen: np.ndarray  # (N,) bool: in the pit, and so put back at the next step
-    count: np.ndarray  # (N,) steps of the path; the last one is the goal
-    cell: np.ndarray  # (N, P) where each step of the path is, NOWHERE at first
-    heading_at: np.ndarray  # (N, P) the direction of the next step
+    path_length: np.ndarray  # (N,) steps of the path; the last one is the goal
+    path_cell: np.ndarray  # (N, P) where each step of the path is, NO_CELL at first
+    direction_at: np.ndarray  # (N, P) the direction of the next step
     reached: np.ndarray  # (N, P) 1 + how often the agent had fallen off when it last was there; 0: never; or REACHED
     step_at: np.ndarray  # (N, M) the inverse of cell: the step of the path that is there, or PIT
-    past: np.ndarray  # (N,) bool: the path behind the agent, if there is any, is shown
+    shows_trail: np.ndarray  # (N,) bool: the path behind the agent, if there is any, is shown
     trail_lane: np.ndarray  # (m,) the lane of each tile of the path that is shown behind any agent
     trail_x: np.ndarray  # (m,) its first pixel, counted along the path
     trail_y: np.ndarray  # (m,)
-    hurt: np.ndarray  # (N,) bool: in the pit, and a cross shows it
-    known: np.ndarray  # (N, M) bool: the agent fell off there before
+    shows_cross: np.ndarray  # (N,) bool: in the pit, and a cross shows it
+    fell_at: np.ndarray  # (N, M) bool: the agent fell off there before
     walls: np.ndarray  # (N, M) bool: the path may not lead there; nothing but the debug view needs it
     segments: np.ndarray  # (N,)
-    furthest: np.ndarray  # (N,) the rightmost column of the path reached so far
+    max_column: np.ndarray  # (N,) the rightmost column of the path reached so far
     stamina: np.ndarray  # (N,) steps left to reach another tile
     fails: np.ndarray  # (N,) how often the agent fell off
     visited: np.ndarray  # (N,) tiles reached so far
     length: np.ndarray  # (N,) steps so far
-    returned: np.ndarray  # (N,) float64: sum of rewards so far
+    episode_return: np.ndarray  # (N,) float64: sum of rewards so far
     # Options that the rules or the drawing need.
     radius: np.ndarray  # (N,) of the agent's body
     speed: np.ndarray  # (N, 1) whole pixels a step, in the endless id
@@ -176,15 +184,15 @@ class State:
     show_past: np.ndarray  # (N,) bool
     show_ground: np.ndarray  # (N,) bool
     show_stamina: np.ndarray  # (N,) bool
-    extras: np.ndarray  # (N,) bool: one of these, but for the past path, or a speed above FAR
-    feedback: np.ndarray  # (N,) bool
+    extras: np.ndarray  # (N,) bool: one of these, but for the past path, or a speed above FAST
+    visual_feedback: np.ndarray  # (N,) bool
     camera: np.ndarray  # (N,) float64: pixels between the screen's left edge and the path's, when the agent is there
-    depth: np.ndarray  # (N,) columns of the past path that are shown, and the agent's own
-    lap: np.ndarray  # (N,) pixels after which the background starts again
+    trail_columns: np.ndarray  # (N,) columns of the past path that are shown, and the agent's own
+    ground_period: np.ndarray  # (N,) pixels after which the background starts again
     figure_x: np.ndarray  # (N,) where the agent is drawn, in the endless id
     cross_x: np.ndarray  # (N,) likewise the cross
     cross_fits: np.ndarray  # (N,) bool: that is on the screen, not behind the stamina bar
-    limit: np.ndarray  # (N,) steps until truncation
+    step_limit: np.ndarray  # (N,) steps until truncation
     stamina_level: np.ndarray  # (N,)
     reward_goal: np.ndarray  # (N,) float64
     reward_fall_off: np.ndarray  # (N,) float64
@@ -192,8 +200,8 @@ class State:
     reward_step: np.ndarray  # (N,) float64
 
 
-PATH_ARRAYS = ("cell", "heading_at", "reached")  # (N, P)
-MAP_ARRAYS = ("step_at", "known", "walls")  # (N, M)
+PATH_ARRAYS = ("path_cell", "direction_at", "reached")  # (N, P)
+MAP_ARRAYS = ("step_at", "fell_at", "walls")  # (N, M)
 
 
 def empty_state(lanes: int, segments: int) -> State:
@@ -201,13 +209,13 @@ def empty_state(lanes: int, segments: int) -> State:
     steps, cells = (SIDE * SIDE + 1,), (segments * SEGMENT * ROWS,)
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("pos", "origin", "tile"), (2,))
     shapes |= {"speed": (1,)} | dict.fromkeys(PATH_ARRAYS, steps) | dict.fromkeys(MAP_ARRAYS, cells)
-    flags = ("fallen", "past", "hurt", "cross_fits", "known", "walls", "extras", "feedback")
+    flags = ("fallen", "shows_trail", "shows_cross", "cross_fits", "fell_at", "walls", "extras", "visual_feedback")
     kinds: dict[str, Any] = dict.fromkeys((*flags, *(f"show_{what}" for what in SHOWN)), bool)
-    kinds |= dict.fromkeys(("returned", "camera"), np.float64)
+    kinds |= dict.fromkeys(("episode_return", "camera"), np.float64)
     kinds |= dict.fromkeys(("reward_goal", "reward_fall_off", "reward_progress", "reward_step"), np.float64)
     names = State.__dataclass_fields__
     s = State(**{name: np.zeros((lanes, *shapes.get(name, ())), kinds.get(name, np.int64)) for name in names})
-    s.cell[:, PIT] = NOWHERE
+    s.path_cell[:, PIT] = NO_CELL
     s.trail_lane = s.trail_x = s.trail_y = np.zeros(0, np.int64)
     return s
 
@@ -223,11 +231,11 @@ SHOWN = {
 
 def make_room(s: State, steps: int, segments: int) -> bool:
     """Widens the state if it cannot hold a path of so many steps and segments; whether it had to."""
-    room = s.known.shape[1] // (SEGMENT * ROWS)
-    if steps < s.cell.shape[1] and segments <= room:
+    room = s.fell_at.shape[1] // (SEGMENT * ROWS)
+    if steps < s.path_cell.shape[1] and segments <= room:
         return False
     # By half as much again at least, so that an ever longer path seldom has to move.
-    steps, segments = max(steps + 1, s.cell.shape[1] * 3 // 2), max(segments, room * 3 // 2)
+    steps, segments = max(steps + 1, s.path_cell.shape[1] * 3 // 2), max(segments, room * 3 // 2)
     for name in PATH_ARRAYS:
         setattr(s, name, widened(getattr(s, name), steps))
     for name in MAP_ARRAYS:
@@ -239,7 +247,7 @@ def make_room(s: State, steps: int, segments: int) -> bool:
 
 # While a path is sampled, a place is column * SIDE + row of a 7 x 7 grid.
 PLACES = [divmod(place, SIDE) for place in range(SIDE * SIDE)]
-CELLS = [column * ROWS + BEYOND + row for column, row in PLACES]
+CELLS = [column * ROWS + PIT_ROWS + row for column, row in PLACES]
 STRAIGHT = ((1, 0), (-1, 0), (0, 1), (0, -1))  # in the original's order
 OBLIQUE = ((1, 1), (-1, -1), (1, -1), (-1, 1))
 
@@ -279,58 +287,58 @@ class Level(NamedTuple):
     walls: list[list[int]]  # the untraceable places of each segment
 
 
-def read_ahead(rng: np.random.Generator, paths: int) -> Tape:
+def read_ahead(rng: np.random.Generator, paths: int) -> WordBuffer:
     """The words that so many paths may take. Asking the generator for one at a time is slow."""
-    return Tape(rng, paths * (DRAWS + SPARE))
+    return WordBuffer(rng, paths * (DRAWS + SPARE))
 
 
 def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
     """Samples a level in the original's order, so that its seeds mean the same here."""
-    tape = read_ahead(rng, FIRST_SEGMENTS if variant.endless else 1)
+    buffer = read_ahead(rng, FIRST_SEGMENTS if variant.endless else 1)
     if variant.endless:
-        level = sample_segments(tape, below(tape, SIDE), 0, FIRST_SEGMENTS)
+        level = sample_segments(buffer, below(buffer, SIDE), 0, FIRST_SEGMENTS)
     else:
-        side = pick(tape, values["cardinal_origin_choice"])
-        start, end = below(tape, SIDE), below(tape, SIDE)
+        side = pick(buffer, values["cardinal_origin_choice"])
+        start, end = below(buffer, SIDE), below(buffer, SIDE)
         near, far = (0, SIDE - 1) if side in (0, 2) else (SIDE - 1, 0)
         if side in (0, 1):
             start, end = near * SIDE + start, far * SIDE + end
         else:
             start, end = start * SIDE + near, end * SIDE + far
-        walls = sample_walls(tape, start, end)
-        level = Level(cells_of(sample_path(tape, walls, start, end), 0), [walls])
-    tape.close()
+        walls = sample_walls(buffer, start, end)
+        level = Level(cells_of(sample_path(buffer, walls, start, end), 0), [walls])
+    buffer.close()
     return level
 
 
-def sample_segments(tape: Tape, row: int, first: int, count: int) -> Level:
+def sample_segments(buffer: WordBuffer, row: int, first: int, count: int) -> Level:
     """Samples segments of an endless path, from this row on, the first of them being segment number `first`."""
     path, every_wall = [], []
     for segment in range(first, first + count):
-        start, end = row, (SIDE - 1) * SIDE + below(tape, SIDE)
-        walls = sample_walls(tape, start, end)
-        path += cells_of(sample_path(tape, walls, start, end), segment)
+        start, end = row, (SIDE - 1) * SIDE + below(buffer, SIDE)
+        walls = sample_walls(buffer, start, end)
+        path += cells_of(sample_path(buffer, walls, start, end), segment)
         path.append(path[-1] + ROWS)  # the transition tile
         every_wall.append(walls)
         row = end % SIDE
     return Level(path, every_wall)
 
 
-def sample_walls(tape: Tape, start: int, end: int) -> list[int]:
+def sample_walls(buffer: WordBuffer, start: int, end: int) -> list[int]:
     """Untraceable places: some inside, some on the border that touch neither those nor start and end.
 
     So there always is a path: along the border, and one ring further inside past the walls that stand there.
     """
-    walls, kept_free = tape.hits(INSIDE, WALLS), NEAR[start] | NEAR[end]
+    walls, kept_free = buffer.sample_each(INSIDE, WALLS), NEAR[start] | NEAR[end]
     for place in walls:
         kept_free |= AROUND[place]
     free = FREE[0][kept_free & 255] + FREE[1][kept_free >> 8 & 255] + FREE[2][kept_free >> 16]
-    return walls + tape.picks(free, (4, 8)[below(tape, 2)])
+    return walls + buffer.take_random(free, (4, 8)[below(buffer, 2)])
 
 
-def sample_path(tape: Tape, walls: list[int], start: int, end: int) -> list[int]:
+def sample_path(buffer: WordBuffer, walls: list[int], start: int, end: int) -> list[int]:
     """The path that A* finds over random costs, not always the cheapest: its places from start to end."""
-    costs, used, distance = tape.eighths, tape.used, DISTANCES[end]
+    costs, used, distance = buffer.eighths, buffer.used, DISTANCES[end]
     cost, total, previous = [UNREACHED] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
     for place in walls:
         cost[place] = CLOSED
@@ -360,7 +368,7 @@ def sample_path(tape: Tape, walls: list[int], start: int, end: int) -> list[int]
         else:
             here, first, opened = first, None, passed
         so_far = cost[here] + 1
-    tape.used = used
+    buffer.used = used
     path = [end]
     while here != start:
         here = previous[here]
@@ -377,37 +385,37 @@ def cells_of(places: list[int], segment: int) -> list[int]:
 def write_level(s: State, lane: int, level: Level, endless: bool) -> None:
     """Starts the lane's episode at this level."""
     s.step_at[lane] = PIT
-    s.known[lane] = s.walls[lane] = s.fallen[lane] = s.hurt[lane] = False
-    s.count[lane] = s.segments[lane] = s.furthest[lane] = s.fails[lane] = s.visited[lane] = 0
-    s.length[lane] = s.returned[lane] = 0
+    s.fell_at[lane] = s.walls[lane] = s.fallen[lane] = s.shows_cross[lane] = False
+    s.path_length[lane] = s.segments[lane] = s.max_column[lane] = s.fails[lane] = s.visited[lane] = 0
+    s.length[lane] = s.episode_return[lane] = 0
     write_path(s, lane, level, endless)
     s.reached[lane] = 0
     s.reached[lane, PIT] = s.reached[lane, 1] = REACHED
     if not endless:
         s.reached[lane, len(level.path)] = REACHED  # the goal has a reward of its own
-    column, row = divmod(level.path[0] - BEYOND, ROWS)
+    column, row = divmod(level.path[0] - PIT_ROWS, ROWS)
     # Not the tile's middle but for the default size, as in the original.
     radius = int(s.radius[lane])
     x, y = column * TILE + radius, row * TILE + radius
     s.pos[lane] = s.origin[lane] = x + PAD, y + PAD
     s.tile[lane] = x // TILE, y // TILE
     s.facing[lane] = 6 if endless else 0
-    s.step[lane], s.at[lane] = NO_STEP, 1  # the first step lands on the origin
-    s.heading[lane] = s.heading_at[lane, 1]
+    s.path_step[lane], s.last_path_step[lane] = NO_STEP, 1  # the first step lands on the origin
+    s.next_direction[lane] = s.direction_at[lane, 1]
     s.stamina[lane] = s.stamina_level[lane]
 
 
 def write_path(s: State, lane: int, level: Level, endless: bool) -> None:
     """Appends to the lane's path, for which there must be room."""
-    first = int(s.count[lane]) + 1
+    first = int(s.path_length[lane]) + 1
     last = first + len(level.path)
-    s.cell[lane, first:last] = level.path
-    path = s.cell[lane, first:last]
+    s.path_cell[lane, first:last] = level.path
+    path = s.path_cell[lane, first:last]
     s.step_at[lane][path] = np.arange(first, last)
-    s.heading_at[lane, first : last - 1] = HEADINGS[path[1:] - path[:-1]]
+    s.direction_at[lane, first : last - 1] = DIRECTIONS[path[1:] - path[:-1]]
     # Behind a transition tile the path goes on to the right. The goal has the direction that leads to it.
-    s.heading_at[lane, last - 1] = EAST if endless else s.heading_at[lane, last - 2]
-    s.count[lane] = last - 1
+    s.direction_at[lane, last - 1] = EAST if endless else s.direction_at[lane, last - 2]
+    s.path_length[lane] = last - 1
     for segment, walls in enumerate(level.walls, int(s.segments[lane])):
         s.walls[lane, cells_of(walls, segment)] = True
     s.segments[lane] += len(level.walls)
@@ -415,9 +423,9 @@ def write_path(s: State, lane: int, level: Level, endless: bool) -> None:
 
 def forget_trails(s: State, lanes: np.ndarray) -> None:
     """Removes the past paths of the lanes from those that are shown."""
-    if np.count_nonzero(s.past[lanes]):
-        s.past[lanes] = False
-        left = s.past.take(s.trail_lane)
+    if np.count_nonzero(s.shows_trail[lanes]):
+        s.shows_trail[lanes] = False
+        left = s.shows_trail.take(s.trail_lane)
         s.trail_lane, s.trail_x, s.trail_y = s.trail_lane[left], s.trail_x[left], s.trail_y[left]
 
 
@@ -490,21 +498,21 @@ def draw(s: State, sheet: Sheet, lanes: np.ndarray | slice, endless: bool) -> np
 
 def draw_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     """Black (n, FRAME), with the path's origin and goal where they are shown."""
-    frames = np.zeros((len(s.at[lanes]), FRAME), np.uint8)
+    frames = np.zeros((len(s.last_path_step[lanes]), FRAME), np.uint8)
     if not np.count_nonzero(s.extras[lanes]):
         return frames
     for shown, kind in ((s.show_origin[lanes], ORIGIN), (s.show_goal[lanes], GOAL)):
         if np.count_nonzero(shown):
             (which,) = shown.nonzero()
-            step = s.count[lanes][which] if kind == GOAL else 1
-            cell = s.cell[lanes][which, step]
+            step = s.path_length[lanes][which] if kind == GOAL else 1
+            cell = s.path_cell[lanes][which, step]
             paste(frames, tiles(), np.full(len(which), kind), tile_centres(cell), which)
     return frames
 
 
 def tile_centres(cell: np.ndarray) -> np.ndarray:
     """(n, 2) the middles of the cells' tiles, with PAD."""
-    return np.stack([cell // ROWS, cell % ROWS - BEYOND], axis=1) * TILE + TILE // 2 + PAD
+    return np.stack([cell // ROWS, cell % ROWS - PIT_ROWS], axis=1) * TILE + TILE // 2 + PAD
 
 
 def draw_endless_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
@@ -512,8 +520,8 @@ def draw_endless_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     if np.count_nonzero(s.extras[lanes]):
         frames = grounds().take(ground_rows(s, lanes), axis=0)
     else:
-        frames = np.zeros((len(s.at[lanes]), FRAME), np.uint8)
-    if np.count_nonzero(s.past[lanes]):
+        frames = np.zeros((len(s.last_path_step[lanes]), FRAME), np.uint8)
+    if np.count_nonzero(s.shows_trail[lanes]):
         draw_trail(frames, s, lanes)
     return frames
 
@@ -522,7 +530,7 @@ def ground_rows(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     """(n,) the rows of grounds() that are behind everything."""
     # Starts again as soon as it has moved by a tile or more, which jumps if the speed does not divide that.
     walked = s.pos[lanes, 0] - s.origin[lanes, 0]
-    return (walked % s.lap[lanes] + 1) * s.show_ground[lanes]
+    return (walked % s.ground_period[lanes] + 1) * s.show_ground[lanes]
 
 
 def draw_trail(frames: np.ndarray, s: State, lanes: np.ndarray | slice) -> None:
@@ -545,10 +553,10 @@ def trail_on_screen(s: State, lanes: np.ndarray | slice) -> tuple[np.ndarray, np
     x = (s.trail_x - (s.pos[:, 0] - s.origin[:, 0] - s.camera)[lane]).astype(np.int64)
     if isinstance(lanes, slice):
         return lane, x, y
-    frame = np.full(len(s.at), NOWHERE)
+    frame = np.full(len(s.last_path_step), NO_CELL)
     frame[lanes] = np.arange(len(lanes))
     owner = frame[lane]
-    mine = owner != NOWHERE
+    mine = owner != NO_CELL
     return owner[mine], x[mine], y[mine]
 
 
@@ -575,7 +583,7 @@ def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: np.ndarray | s
     if extras:
         shown = s.show_stamina[lanes]
         frames.reshape(-1, SCREEN, ROW)[shown, :, -3 * BAR :] = bars()[spent_stamina(s, lanes)[shown]]
-    (which,) = s.hurt[lanes].nonzero()
+    (which,) = s.shows_cross[lanes].nonzero()
     if which.size:
         cross = pos[which]
         if endless:
@@ -589,7 +597,7 @@ CROSS_FITS = abs(np.arange(SPAN) - PAD - SCREEN // 2) < (SCREEN + CROSS) // 2  #
 CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # (4, 2)
 
 
-class Scene(NamedTuple):
+class ViewOptions(NamedTuple):
     """What decides how much of an agent shows. Lanes whose options agree share one."""
 
     scale: float
@@ -599,21 +607,21 @@ class Scene(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def looks(scenes: tuple[Scene, ...]) -> Looks:
-    """What can be seen of the agent in these scenes, without a cross and with one."""
+def appearance_tables(every: tuple[ViewOptions, ...]) -> AppearanceTables:
+    """What can be seen of the agent with these view options, without a cross and with one."""
     views = []
-    for scene in scenes:
+    for options in every:
         free = np.zeros((SCREEN, SCREEN), bool)
-        free[:, : scene.width] = True
-        rows = range(SPAN) if scene.column else range(PAD, PAD + SCREEN + LARGEST + 1)
-        columns = range(scene.column, scene.column + 1) if scene.column else rows
-        image, solid = sprites(scene.scale)
-        for picture in ((image, solid), crossed(image, solid, scene.aside)):
-            views.append(View(scene.scale, *picture, free, columns, rows))
-    return make_looks(views)
+        free[:, : options.width] = True
+        rows = range(SPAN) if options.column else range(PAD, PAD + SCREEN + LARGEST_RADIUS + 1)
+        columns = range(options.column, options.column + 1) if options.column else rows
+        image, solid = sprites(options.scale)
+        for picture in ((image, solid), with_cross(image, solid, options.aside)):
+            views.append(View(options.scale, *picture, free, columns, rows))
+    return make_appearance_tables(views)
 
 
-def crossed(image: np.ndarray, solid: np.ndarray, aside: int) -> tuple[np.ndarray, np.ndarray]:
+def with_cross(image: np.ndarray, solid: np.ndarray, aside: int) -> tuple[np.ndarray, np.ndarray]:
     """The figure's sprites with a cross over them, so far right of their middle."""
     margin = max(0, CROSS // 2 + abs(aside) - solid.shape[1] // 2)
     around = ((0, 0), (margin, margin), (margin, margin))
@@ -624,17 +632,19 @@ def crossed(image: np.ndarray, solid: np.ndarray, aside: int) -> tuple[np.ndarra
     return image, solid
 
 
-def show_ends(out: np.ndarray, s: State, lanes: np.ndarray | slice, looks: Looks, sprite: np.ndarray) -> None:
+def write_ends(
+    out: np.ndarray, s: State, lanes: np.ndarray | slice, tables: AppearanceTables, sprite: np.ndarray
+) -> None:
     """Writes the path's origin and goal to out, (n, 4) and zeros so far, where they are shown and not hidden."""
-    which, last = np.arange(len(out)), s.count[lanes]
+    which, last = np.arange(len(out)), s.path_length[lanes]
     for end, shown, step in ((0, s.show_origin[lanes], np.ones_like(last)), (2, s.show_goal[lanes], last)):
-        centre = tile_centres(s.cell[lanes][which, step])  # (n, 2)
+        centre = tile_centres(s.path_cell[lanes][which, step])  # (n, 2)
         points = centre[:, None] - TILE // 2 + CORNERS * (TILE - 1)  # (n, 4, 2)
-        shown = shown & ~covered(looks, sprite, s.pos[lanes], points).all(axis=1)
+        shown = shown & ~covered(tables, sprite, s.pos[lanes], points).all(axis=1)
         out[:, end : end + 2] = (centre - PAD) / SCREEN * shown[:, None]
 
 
-def show_trail(out: np.ndarray, s: State, lanes: np.ndarray | slice, looks: Looks, agent: Any) -> None:
+def write_trail(out: np.ndarray, s: State, lanes: np.ndarray | slice, tables: AppearanceTables, agent: Any) -> None:
     """Writes the past path and the scroll of its tiles to out, (n, 57) and zeros so far. A tile shows if a corner does.
 
     agent: sprites (n,) and where they are drawn (n, 2) of agents that may hide a tile, or None.
@@ -653,7 +663,7 @@ def show_trail(out: np.ndarray, s: State, lanes: np.ndarray | slice, looks: Look
     if agent is not None:
         corners = np.stack([x, y], axis=1)[:, None] + abs(CORNERS * (TILE - 1) - np.reshape(inset, (-1, 1, 1)))
         free = (corners[..., 0] >= 0) & (corners[..., 0] < np.reshape(width, (-1, 1)))  # (m, 4)
-        shown &= (free & ~covered(looks, *(each[owner] for each in agent), corners + PAD)).any(axis=1)
+        shown &= (free & ~covered(tables, *(each[owner] for each in agent), corners + PAD)).any(axis=1)
     owner, x, y = owner[shown], x[shown], y[shown]
     out[owner, (x // TILE + 1) * SIDE + y // TILE] = 1.0
     # Not all of a path's tiles have the same, where the camera is between two pixels.
@@ -667,13 +677,13 @@ ENDLESS_MOVES = np.array([(0, 0), (1, 0), (0, -1), (0, 1)])  # (4, 2)
 ENDLESS_TURN = np.array([(facing, 6, 0, 4) for facing in range(FACINGS)])  # (8, 4) the next facing
 
 
-def land(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: bool) -> None:
+def enter_tiles(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: bool) -> None:
     """What happens on another tile, or in the pit. Where the agent has not moved on, this changes nothing.
 
     lane_path: (N,) where the lane's steps start in the flattened path. rewards: (N,), changed in place.
     """
-    s.at = np.where(s.fallen, s.at, s.step)
-    here, now = s.step + lane_path, s.fails + 1
+    s.last_path_step = np.where(s.fallen, s.last_path_step, s.path_step)
+    here, now = s.path_step + lane_path, s.fails + 1
     before = s.reached.take(here)
     fresh = before == 0
     if np.count_nonzero(fresh):
@@ -686,23 +696,23 @@ def land(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: bool) ->
     if np.count_nonzero(s.fallen):
         rewards += s.fallen * s.reward_fall_off
         s.fails += s.fallen
-    s.hurt = s.fallen & s.feedback
-    heading = s.heading_at.take(s.at + lane_path)
+    s.shows_cross = s.fallen & s.visual_feedback
+    direction = s.direction_at.take(s.last_path_step + lane_path)
     if endless:
         # The ground truth has no entry for the west.
-        np.copyto(heading, s.heading, where=heading == WEST)
-        s.past = s.show_past & (s.tile[:, 0] > 0)
-        follow(s, lane_path)
-    s.heading = heading
+        np.copyto(direction, s.next_direction, where=direction == WEST)
+        s.shows_trail = s.show_past & (s.tile[:, 0] > 0)
+        update_trails(s, lane_path)
+    s.next_direction = direction
 
 
-def follow(s: State, lane_path: np.ndarray) -> None:
+def update_trails(s: State, lane_path: np.ndarray) -> None:
     """Finds the path behind the agents that is shown."""
-    (lanes,) = s.past.nonzero()
+    (lanes,) = s.shows_trail.nonzero()
     if lanes.size:
         s.trail_lane, cell = trail(s, lanes, lane_path)
         column, row = np.divmod(cell, ROWS)
-        s.trail_x, s.trail_y = column * TILE, (row - BEYOND) * TILE
+        s.trail_x, s.trail_y = column * TILE, (row - PIT_ROWS) * TILE
 
 
 def trail(s: State, lanes: np.ndarray, lane_path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -710,24 +720,25 @@ def trail(s: State, lanes: np.ndarray, lane_path: np.ndarray) -> tuple[np.ndarra
 
     From the last step but one backwards, up to the first that is as far to the left as the camera's offset in tiles.
     """
-    at = s.at.take(lanes)
-    bound = np.maximum(s.tile[:, 0] - s.depth, 1).take(lanes) * ROWS  # (n,) cells below that are far enough left
+    at = s.last_path_step.take(lanes)
+    first_column = np.maximum(s.tile[:, 0] - s.trail_columns, 1).take(lanes)  # (n,)
+    bound = first_column * ROWS  # cells below that are far enough left
     back = BACK[: int(at.max())]  # (K,)
     # What is before the pit is of another lane, but nobody gets there: the pit's cell is left of everything.
-    cells = s.cell.take((at + lane_path.take(lanes))[:, None] - back)  # (n, K)
+    cells = s.path_cell.take((at + lane_path.take(lanes))[:, None] - back)  # (n, K)
     count = (cells < bound[:, None]).argmax(axis=1) + 1  # (n,)
     np.minimum(count, at - 1, out=count)
     return lanes.repeat(count), cells[back <= count[:, None]]
 
 
-def fall(s: State, cell: np.ndarray) -> np.ndarray:
+def fatal_falls(s: State, cell: np.ndarray) -> np.ndarray:
     """The endless id: who fell off where the episode ends, (N,) bool.
 
     cell: (N,) the agents' places in the flattened map.
     """
-    over = s.fallen & ((s.tile[:, 0] < s.furthest) | s.known.take(cell))
+    over = s.fallen & ((s.tile[:, 0] < s.max_column) | s.fell_at.take(cell))
     # Never forgotten: the original means to, on progress, but compares before there can be any.
-    s.known.put(cell[s.fallen], True)
+    s.fell_at.put(cell[s.fallen], True)
     return over
 
 
@@ -779,7 +790,7 @@ class MysteryPath(MemoryGymVectorEnv):
     """
 
     variants = VARIANTS
-    tables = (*MemoryGymVectorEnv.tables, "_looks")
+    tables = (*MemoryGymVectorEnv.tables, "_appearance")
     growing = (*PATH_ARRAYS, *MAP_ARRAYS, "trail_lane", "trail_x", "trail_y")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
@@ -792,19 +803,19 @@ class MysteryPath(MemoryGymVectorEnv):
         """Makes the state of N lanes."""
         self.state = empty_state(self.num_envs, FIRST_SEGMENTS + 1 if self.variant.endless else 1)
         self.figures = (self._figure(self.defaults),)  # all that differ, of all lanes
-        self.scenes = (self._scene(self.defaults),)  # likewise
+        self.view_options = (self._view_options(self.defaults),)  # likewise
         self.place_tables()
 
     def configure(self, lanes: np.ndarray) -> None:
         """Takes over the options of the lanes, and the tables that all lanes' options need."""
         s, values = self.state, self.settings[int(lanes[0])]
-        s.limit[lanes] = NO_LIMIT if values["max_steps"] == -1 else values["max_steps"]
-        s.feedback[lanes] = values["visual_feedback"]
+        s.step_limit[lanes] = NO_LIMIT if values["max_steps"] == -1 else values["max_steps"]
+        s.visual_feedback[lanes] = values["visual_feedback"]
         s.radius[lanes] = radius_of(0.25 if self.variant.grid else values["agent_scale"])
         for what, option in SHOWN.items():
             getattr(s, f"show_{what}")[lanes] = values.get(option, False)
         shown = any(values.get(option, False) for what, option in SHOWN.items() if what != "past")
-        s.extras[lanes] = shown or values.get("agent_speed", 0.0) > FAR
+        s.extras[lanes] = shown or values.get("agent_speed", 0.0) > FAST
         s.reward_goal[lanes] = values.get("reward_goal", 0.0)
         s.reward_fall_off[lanes] = values["reward_fall_off"]
         s.reward_progress[lanes] = values["reward_path_progress"]
@@ -813,14 +824,15 @@ class MysteryPath(MemoryGymVectorEnv):
         if self.variant.endless:
             self._place_camera(lanes, values)
         self.figures, s.figure[:] = numbered([self._figure(each) for each in self.settings])
-        self.scenes, s.scene[:] = numbered([self._scene(each) for each in self.settings])
+        self.view_options, s.view[:] = numbered([self._view_options(each) for each in self.settings])
         self.place_tables()
 
     def _place_camera(self, lanes: np.ndarray, values: dict[str, Any]) -> None:
         s, speed = self.state, int(values["agent_speed"])
-        s.camera[lanes], s.depth[lanes] = TILE * values["camera_offset_scale"], int(values["camera_offset_scale"])
+        s.camera[lanes] = TILE * values["camera_offset_scale"]
+        s.trail_columns[lanes] = int(values["camera_offset_scale"])
         s.speed[lanes] = speed
-        s.lap[lanes] = speed * math.ceil(TILE / speed) if speed else 1
+        s.ground_period[lanes] = speed * math.ceil(TILE / speed) if speed else 1
         s.figure_x[lanes], s.cross_x[lanes] = camera_columns(values)
         s.cross_fits[lanes] = camera_columns(values)[1] < PAD + SCREEN - BAR * values["show_stamina"] + CROSS // 2
 
@@ -830,12 +842,12 @@ class MysteryPath(MemoryGymVectorEnv):
         scale = values["agent_scale"]
         return Figure(scale, values["agent_speed"], 0, SCREEN, radius_of(scale), False)
 
-    def _scene(self, values: dict[str, Any]) -> Scene:
+    def _view_options(self, values: dict[str, Any]) -> ViewOptions:
         scale = 0.25 if self.variant.grid else values["agent_scale"]
         if not self.variant.endless:
-            return Scene(scale, None, 0, SCREEN)
+            return ViewOptions(scale, None, 0, SCREEN)
         figure_x, cross_x = camera_columns(values)
-        return Scene(scale, figure_x, cross_x - figure_x, SCREEN - BAR * values["show_stamina"])
+        return ViewOptions(scale, figure_x, cross_x - figure_x, SCREEN - BAR * values["show_stamina"])
 
     def place_tables(self) -> None:
         """The flat tables that step() looks things up in, and where each lane's rows start in them."""
@@ -843,13 +855,13 @@ class MysteryPath(MemoryGymVectorEnv):
         self._controls = grid_controls() if self.variant.grid else free_controls()
         self._truths = np.eye(4)[:, : 3 if self.variant.endless else 4].copy()
         self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
-        self._lane_map = np.arange(self.num_envs) * self.state.step_at.shape[1] + BEYOND  # (N,)
-        self._lane_path = np.arange(self.num_envs) * self.state.cell.shape[1]  # (N,)
+        self._lane_map = np.arange(self.num_envs) * self.state.step_at.shape[1] + PIT_ROWS  # (N,)
+        self._lane_path = np.arange(self.num_envs) * self.state.path_cell.shape[1]  # (N,)
         if self.obs_type == "vector":
-            self._looks = looks(self.scenes)
+            self._appearance = appearance_tables(self.view_options)
             self._at = vector_slices(self.variant.entries)
             # An agent that is no wider than a tile cannot hide one.
-            self._large = any(2 * radius_of(scene.scale) > TILE for scene in self.scenes)
+            self._large = any(2 * radius_of(options.scale) > TILE for options in self.view_options)
 
     def begin(self, lanes: np.ndarray) -> None:
         """Samples the lanes' next levels and starts their episodes."""
@@ -867,33 +879,33 @@ class MysteryPath(MemoryGymVectorEnv):
         self._move(actions)
         if endless:
             s.tile = (s.pos - PAD) // TILE  # (N, 2)
-            self._lengthen()
+            self._extend_paths()
         else:
             s.tile = TILE_AT.take(s.pos)  # (N, 2)
         cell = s.tile.dot(MAP_STRIDES) + self._lane_map  # (N,)
-        before, s.step = s.step, s.step_at.take(cell)
-        s.fallen = s.step == PIT
+        before, s.path_step = s.path_step, s.step_at.take(cell)
+        s.fallen = s.path_step == PIT
         rewards = s.reward_step.copy()
-        landed = np.count_nonzero(s.step != before)
+        landed = np.count_nonzero(s.path_step != before)
         if landed:
-            land(s, self._lane_path, rewards, endless)
-        terminated = self._tire(cell, landed) if endless else s.step == s.count
+            enter_tiles(s, self._lane_path, rewards, endless)
+        terminated = self._spend_stamina(cell, landed) if endless else s.path_step == s.path_length
         if not endless and np.count_nonzero(terminated):
             rewards += terminated * s.reward_goal
-        s.returned += rewards
-        truncated = s.length == s.limit
+        s.episode_return += rewards
+        truncated = s.length == s.step_limit
         if np.count_nonzero(truncated):
             truncated &= ~terminated
         return rewards, terminated, truncated
 
-    def _tire(self, cell: np.ndarray, landed: int) -> np.ndarray:
+    def _spend_stamina(self, cell: np.ndarray, landed: int) -> np.ndarray:
         """The endless id: who has no stamina left, or fell off where it must not; (N,) bool."""
         s = self.state
         if not landed:
             s.stamina -= 1
             return s.stamina == 0
-        over = fall(s, cell) if np.count_nonzero(s.fallen) else False
-        s.furthest = np.where(s.fallen, s.furthest, np.maximum(s.furthest, s.tile[:, 0]))
+        over = fatal_falls(s, cell) if np.count_nonzero(s.fallen) else False
+        s.max_column = np.where(s.fallen, s.max_column, np.maximum(s.max_column, s.tile[:, 0]))
         s.stamina -= 1
         return (s.stamina == 0) | over
 
@@ -904,25 +916,25 @@ class MysteryPath(MemoryGymVectorEnv):
         if np.count_nonzero(s.fallen):
             action = np.where(s.fallen, 0, action)
             s.pos = np.where(s.fallen[:, None], s.origin, s.pos)
-            s.step[s.fallen] = NO_STEP  # what it lands on is another tile, even if that is the pit again
+            s.path_step[s.fallen] = NO_STEP  # what it lands on is another tile, even if that is the pit again
         if endless:
             s.facing = ENDLESS_TURN.take(s.facing * len(ENDLESS_MOVES) + action)
             s.pos = s.pos + ENDLESS_MOVES.take(action, axis=0) * s.speed
         else:
             s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._agent_tables.walk)
 
-    def _lengthen(self) -> None:
+    def _extend_paths(self) -> None:
         """Appends a segment to the paths whose last one was just entered."""
         s = self.state
         entered = s.tile[:, 0] >= (s.segments - 1) * SEGMENT
         if not np.count_nonzero(entered):
             return
         for lane in np.flatnonzero(entered).tolist():
-            steps, segments = int(s.count[lane]), int(s.segments[lane])
-            row = int(s.cell[lane, steps]) % ROWS - BEYOND
-            tape = read_ahead(self._rngs[lane], 1)
-            level = sample_segments(tape, row, segments, 1)
-            tape.close()
+            steps, segments = int(s.path_length[lane]), int(s.segments[lane])
+            row = int(s.path_cell[lane, steps]) % ROWS - PIT_ROWS
+            buffer = read_ahead(self._rngs[lane], 1)
+            level = sample_segments(buffer, row, segments, 1)
+            buffer.close()
             if make_room(s, steps + len(level.path), segments + 1):
                 self.place_tables()
             write_path(s, lane, level, endless=True)
@@ -930,27 +942,27 @@ class MysteryPath(MemoryGymVectorEnv):
     def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32."""
         s, at, endless = self.state, self._at, self.variant.endless
-        pos, hurt = place_on_screen(s, lanes, endless), s.hurt[lanes]
-        sprite = (2 * s.scene[lanes] + hurt) * FACINGS + s.facing[lanes]  # (n,)
-        out = np.zeros((len(hurt), *self.single_observation_space.shape), np.float32)
-        look(out[:, at["size"].start : at["facing"].stop], self._looks, sprite, pos)
+        pos, shows_cross = place_on_screen(s, lanes, endless), s.shows_cross[lanes]
+        sprite = (2 * s.view[lanes] + shows_cross) * FACINGS + s.facing[lanes]  # (n,)
+        out = np.zeros((len(sprite), *self.single_observation_space.shape), np.float32)
+        write_agent_entries(out[:, at["size"].start : at["facing"].stop], self._appearance, sprite, pos)
         if endless:
-            self._show_endless(out, lanes, sprite, pos)
+            self._write_endless(out, lanes, sprite, pos)
         else:
-            out[:, at["cross"]] = hurt[:, None]
+            out[:, at["cross"]] = shows_cross[:, None]
             if np.count_nonzero(s.extras[lanes]):
-                show_ends(out[:, at["origin"].start : at["goal"].stop], s, lanes, self._looks, sprite)
+                write_ends(out[:, at["origin"].start : at["goal"].stop], s, lanes, self._appearance, sprite)
         return out
 
-    def _show_endless(self, out: np.ndarray, lanes: np.ndarray | slice, sprite: np.ndarray, pos: np.ndarray) -> None:
+    def _write_endless(self, out: np.ndarray, lanes: np.ndarray | slice, sprite: np.ndarray, pos: np.ndarray) -> None:
         """Writes what only the endless id has, or has off the screen."""
         s, at = self.state, self._at
-        hurt = s.hurt[lanes]
-        if np.count_nonzero(hurt):
-            out[:, at["cross"].start] = hurt & s.cross_fits[lanes] & CROSS_FITS.take(pos[:, 1])
-        if np.count_nonzero(s.past[lanes]):
+        shows_cross = s.shows_cross[lanes]
+        if np.count_nonzero(shows_cross):
+            out[:, at["cross"].start] = shows_cross & s.cross_fits[lanes] & CROSS_FITS.take(pos[:, 1])
+        if np.count_nonzero(s.shows_trail[lanes]):
             trail = out[:, at["past"].start : at["scroll"].stop]
-            show_trail(trail, s, lanes, self._looks, (sprite, pos) if self._large else None)
+            write_trail(trail, s, lanes, self._appearance, (sprite, pos) if self._large else None)
         if np.count_nonzero(s.extras[lanes]):
             out[:, at["ground"].start] = ground_rows(s, lanes) / TILE
             out[:, at["bar"].start] = s.show_stamina[lanes]
@@ -962,24 +974,24 @@ class MysteryPath(MemoryGymVectorEnv):
 
     def ground_truth(self) -> np.ndarray:
         """A fresh (N, 4), endless (N, 3): the direction of the path's next tile."""
-        return self._truths.take(self.state.heading, axis=0)
+        return self._truths.take(self.state.next_direction, axis=0)
 
     def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
         """The lanes' ended episodes in numbers."""
         s = self.state
-        numbers = {"reward": s.returned[lanes], "length": s.length[lanes]}
+        numbers = {"reward": s.episode_return[lanes], "length": s.length[lanes]}
         if self.variant.endless:
-            places = {"max_x": s.furthest[lanes], "tiles_visited": s.visited[lanes]}
+            places = {"max_x": s.max_column[lanes], "tiles_visited": s.visited[lanes]}
             return numbers | {"num_fails": s.fails[lanes]} | places
-        success = (s.step[lanes] == s.count[lanes]).astype(np.int64)
+        success = (s.path_step[lanes] == s.path_length[lanes]).astype(np.int64)
         return numbers | {"success": success, "num_fails": s.fails[lanes]}
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Draws the path in white, its origin and transition tiles blue, its goal green, walls red, then the agent."""
         s, one, endless = self.state, np.array([lane]), self.variant.endless
         small = draw_endless_ground(s, one) if endless else draw_ground(s, one)  # (1, FRAME)
-        steps = int(s.count[lane])
-        path = s.cell[lane, 1 : steps + 1].tolist()
+        steps = int(s.path_length[lane])
+        path = s.path_cell[lane, 1 : steps + 1].tolist()
         marks = [(cell, ORIGIN if cell // ROWS % SEGMENT == SIDE else STEP) for cell in path]
         marks[0] = (marks[0][0], ORIGIN)
         if not endless:

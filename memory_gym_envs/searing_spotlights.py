@@ -185,48 +185,48 @@ class State:
 
     pos: np.ndarray  # (N, 2) the agent's centre, x and y
     facing: np.ndarray  # (N,)
-    look: np.ndarray  # (N,) the facing that is drawn
+    drawn_facing: np.ndarray  # (N,) the facing that is drawn
     figure: np.ndarray  # (N,) which of the batch's figures the agent is
     bodies: np.ndarray  # (2, N, B) x and y of the agent, the exit and the coins; GONE where there is none
-    touch: np.ndarray  # (N, B) float64: square of the distance at which the agent touches them
-    props: np.ndarray  # (N,) the row of the props' sheet with the lane's coin; its closed and its open exit follow
+    touch_squared: np.ndarray  # (N, B) float64: square of the distance at which the agent touches them
+    coin_sprite: np.ndarray  # (N,) the sprite of the lane's coin; those of its closed and its open exit follow
     is_open: np.ndarray  # (N,) 1 if the exit is open
-    goal: np.ndarray  # (N, 4) float64: x and y of the first coin left and of the exit; 0 where there is none
-    coins: np.ndarray  # (N,) in this episode
-    left: np.ndarray  # (N,) of them
+    targets: np.ndarray  # (N, 4) float64: x and y of the first coin left and of the exit; 0 where there is none
+    num_coins: np.ndarray  # (N,) in this episode
+    coins_left: np.ndarray  # (N,) of them
     collected: np.ndarray  # (N,) coins so far
     coin_age: np.ndarray  # (N,) steps since the coin appeared (endless)
     success: np.ndarray  # (N,) 1 when the task is done
     spots: np.ndarray  # (11, N, S) float64: the spotlights, oldest first; see TIME .. BEND
     spot_key: np.ndarray  # (N, S) where the radius begins in SpotStencils, with PLACE_0 added; or NO_KEY
-    count: np.ndarray  # (N,) spotlights
-    place: np.ndarray  # (2, N, S) where each one shines, x and y as indices of SpotStencils; 0 where it doesn't
-    seen: np.ndarray  # (N,) bool: some of the agent may be in the light
-    wait: np.ndarray  # (N,) steps until the next one
-    spawns: np.ndarray  # (N,) spotlights to follow
+    num_spots: np.ndarray  # (N,) spotlights
+    spot_place: np.ndarray  # (2, N, S) where each one shines, x and y as indices of SpotStencils; 0 where it doesn't
+    near_light: np.ndarray  # (N,) bool: some of the agent may be in the light
+    spawn_wait: np.ndarray  # (N,) steps until the next one
+    spawns_left: np.ndarray  # (N,) spotlights to follow
     health: np.ndarray  # (N,) float64
     scenery: np.ndarray  # (2 * N, FRAME) uint8: each lane's floor, coins and exit in full light: calm, then alarmed
     floor: np.ndarray  # (N,) which row of the scenery shows
-    red: np.ndarray  # (N,) pixels of the top bar that show lost health
+    lost_width: np.ndarray  # (N,) pixels of the top bar that show lost health
     last_action: np.ndarray  # (N,) 3 * horizontal + vertical
     shown_action: np.ndarray  # (N,) that of the step before
     last_gain: np.ndarray  # (N,) 1, or 2 after a positive reward
     shown_gain: np.ndarray  # (N,) that of the step before; 0 before the first step
     length: np.ndarray  # (N,) steps so far
-    returned: np.ndarray  # (N,) float64: sum of rewards so far
+    episode_return: np.ndarray  # (N,) float64: sum of rewards so far
     # Options that the rules or the pictures need at every step.
-    limit: np.ndarray  # (N,) steps until truncation
+    step_limit: np.ndarray  # (N,) steps until truncation
     coin_limit: np.ndarray  # (N,) steps to collect a coin in
-    coin_show: np.ndarray  # (N,) age until which coins are visible in the dark
-    interval: np.ndarray  # (N,) steps between spotlights
-    full: np.ndarray  # (N,) float64: health at the start
+    coin_show_limit: np.ndarray  # (N,) age until which coins are visible in the dark
+    spawn_interval: np.ndarray  # (N,) steps between spotlights
+    full_health: np.ndarray  # (N,) float64: health at the start
     damage: np.ndarray  # (N,) float64
     floors: np.ndarray  # (N, 2) rows of floors(): while the agent is in the dark, and in the light
     rim: np.ndarray  # (N,) bool: spotlights have a white rim
     darkness: np.ndarray  # (N, FADE) uint8: opacity of the dark after so many steps
     dark_at: np.ndarray  # (N,) steps until it is opaque and nothing else
     reddens: np.ndarray  # (N,) 1 if the floor is red while the agent is in the light
-    senses: np.ndarray  # (N,) the first row of bars() that shows what the lane may see
+    first_bar: np.ndarray  # (N,) the first row of bars() that shows what the lane may see
     exit_layer: np.ndarray  # (N,) UNDER the dark, or above it and BELOW_BAR or ABOVE_BAR
     agent_layer: np.ndarray  # (N,) likewise
     layered: np.ndarray  # (N,) bool: either is above the dark
@@ -243,12 +243,12 @@ FADE = 257  # steps after which the darkness no longer changes
 
 def empty_state(lanes: int) -> State:
     """The state of N lanes before their first reset, with room for no coin and one spotlight."""
-    shapes = {"pos": (lanes, 2), "bodies": (2, lanes, COIN), "touch": (lanes, COIN)}
-    shapes |= {"goal": (lanes, 4), "spots": (len(NO_SPOT), lanes, 1), "spot_key": (lanes, 1), "darkness": (lanes, FADE)}
-    shapes |= {"place": (2, lanes, 1), "scenery": (2 * lanes, FRAME), "floors": (lanes, 2)}
-    floats = ("touch", "goal", "spots", "health", "returned", "full", "damage")
+    shapes = {"pos": (lanes, 2), "bodies": (2, lanes, COIN), "touch_squared": (lanes, COIN)}
+    shapes |= {"spots": (len(NO_SPOT), lanes, 1), "spot_key": (lanes, 1), "spot_place": (2, lanes, 1)}
+    shapes |= {"targets": (lanes, 4), "darkness": (lanes, FADE), "scenery": (2 * lanes, FRAME), "floors": (lanes, 2)}
+    floats = ("touch_squared", "targets", "spots", "health", "episode_return", "full_health", "damage")
     rewards = ("reward_inside", "reward_outside", "reward_death", "reward_coin", "reward_exit")
-    kinds = dict.fromkeys((*floats, *rewards), np.float64) | dict.fromkeys(("seen", "rim", "layered"), bool)
+    kinds = dict.fromkeys((*floats, *rewards), np.float64) | dict.fromkeys(("near_light", "rim", "layered"), bool)
     kinds |= dict.fromkeys(("darkness", "scenery"), np.uint8)
     names = State.__dataclass_fields__
     return State(**{name: np.zeros(shapes.get(name, (lanes,)), kinds.get(name, np.int64)) for name in names})
@@ -256,12 +256,12 @@ def empty_state(lanes: int) -> State:
 
 def make_room(s: State, coins: int = 0, spots: int = 0) -> None:
     """Widens the state's arrays, where they are too narrow, for so many coins and spotlights in a lane."""
-    s.bodies, s.touch = widened(s.bodies, COIN + coins, GONE), widened(s.touch, COIN + coins)
+    s.bodies, s.touch_squared = widened(s.bodies, COIN + coins, GONE), widened(s.touch_squared, COIN + coins)
     old = s.spot_key.shape[1]
     if spots > old:
         s.spots, s.spot_key = widened(s.spots, spots), widened(s.spot_key, spots, NO_KEY)
         s.spots[:, :, old:] = NO_SPOT[:, None, None]
-        s.place = widened(s.place, spots)
+        s.spot_place = widened(s.spot_place, spots)
 
 
 # ---- levels ----
@@ -376,48 +376,48 @@ def write_level(s: State, lane: int, level: Level, spawns: int) -> None:
     coins = len(level.coins)
     make_room(s, spots=len(level.spots))
     # Before the first step the agent is drawn facing up wherever it faces, as in the original.
-    if s.look is s.facing:
-        s.look = s.look.copy()
-    s.facing[lane], s.look[lane] = level.facing, 0
+    if s.drawn_facing is s.facing:
+        s.drawn_facing = s.drawn_facing.copy()
+    s.facing[lane], s.drawn_facing[lane] = level.facing, 0
     s.bodies[:, lane] = GONE
     s.bodies[:, lane, AGENT] = level.pos
     for axis in range(2):
         s.pos[lane, axis] = level.pos[axis] + PAD
     for coin, place in enumerate(level.coins):
         s.bodies[:, lane, COIN + coin] = place
-    s.goal[lane] = 0.0
+    s.targets[lane] = 0.0
     if level.exit is not None:
-        s.bodies[:, lane, EXIT] = s.goal[lane, 2:] = level.exit
-    s.coins[lane] = s.left[lane] = coins
-    aim(s, lane)
-    s.spots[:, lane], s.spot_key[lane], s.count[lane] = NO_SPOT[:, None], NO_KEY, len(level.spots)
+        s.bodies[:, lane, EXIT] = s.targets[lane, 2:] = level.exit
+    s.num_coins[lane] = s.coins_left[lane] = coins
+    update_targets(s, lane)
+    s.spots[:, lane], s.spot_key[lane], s.num_spots[lane] = NO_SPOT[:, None], NO_KEY, len(level.spots)
     if level.spots:
         s.spots[:, lane, : len(level.spots)] = np.array(level.spots).T
         s.spot_key[lane, : len(level.spots)] = [spot[RADIUS] * PLACES + PLACE_0 for spot in level.spots]
-    s.place[:, lane], s.seen[lane] = 0, False  # they shine from the first step on
-    s.spawns[lane], s.wait[lane] = spawns, s.interval[lane] if spawns else NO_LIMIT
-    s.health[lane] = s.full[lane]
+    s.spot_place[:, lane], s.near_light[lane] = 0, False  # they shine from the first step on
+    s.spawns_left[lane], s.spawn_wait[lane] = spawns, s.spawn_interval[lane] if spawns else NO_LIMIT
+    s.health[lane] = s.full_health[lane]
     s.floor[lane] = 2 * lane
-    for field in (s.collected, s.coin_age, s.success, s.is_open, s.red, s.length):
+    for field in (s.collected, s.coin_age, s.success, s.is_open, s.lost_width, s.length):
         field[lane] = 0
     s.last_action[lane] = s.shown_action[lane] = s.shown_gain[lane] = 0
-    s.last_gain[lane], s.returned[lane] = 1, 0.0
+    s.last_gain[lane], s.episode_return[lane] = 1, 0.0
 
 
 def add_spot(s: State, lane: int, spot: list[float]) -> None:
     """Adds a spotlight to the lane's."""
-    at = int(s.count[lane])
+    at = int(s.num_spots[lane])
     if at == s.spot_key.shape[1]:
         make_room(s, spots=at + 2)
     s.spots[:, lane, at] = spot
     s.spot_key[lane, at] = spot[RADIUS] * PLACES + PLACE_0
-    s.count[lane] = at + 1
+    s.num_spots[lane] = at + 1
 
 
-def aim(s: State, lane: int) -> None:
+def update_targets(s: State, lane: int) -> None:
     """Makes the first coin left the lane's goal."""
     coins = np.flatnonzero(s.bodies[0, lane, COIN:] != GONE)
-    s.goal[lane, :2] = s.bodies[:, lane, COIN + coins[0]] if coins.size else 0.0
+    s.targets[lane, :2] = s.bodies[:, lane, COIN + coins[0]] if coins.size else 0.0
 
 
 # ---- drawing ----
@@ -444,14 +444,15 @@ def floors() -> np.ndarray:
 
 
 WIDTHS = SCREEN + 1  # of lost health in the top bar: a last hit may reach beyond the bar's half
-SENSES = 3 * 3 * 3 * WIDTHS  # rows of bars() for one choice of what to show
+BARS_PER_CHOICE = 3 * 3 * 3 * WIDTHS  # rows of bars() for one choice of what to show
 
 
 @cache
 def bars(endless: bool) -> np.ndarray:
-    """(4 * SENSES, ROW) uint8, read-only: the top bar, by what it shows, both actions, last gain and lost health.
+    """(4 * BARS_PER_CHOICE, ROW) uint8, read-only: the top bar, by what it shows and how that is.
 
-    What it shows: 1 for actions + 2 for positive rewards. Last gain: 0 before the first step, 1, 2 for a positive one.
+    What it shows: 1 for actions + 2 for positive rewards. How that is: both actions, last gain (0 before the first
+    step, 1, 2 for a positive one) and lost health.
     """
     half, quarter = SCREEN // 2, SCREEN // 4
     table = np.zeros((2, 2, 3, 3, 3, WIDTHS, SCREEN, 3), np.uint8)
@@ -492,7 +493,7 @@ def spot_shapes(least: int, largest: int) -> tuple[list[np.ndarray], list[np.nda
     return [NOTHING] * least + disks, [NOTHING] * least + rims
 
 
-def draw_props(scales: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.ndarray]:
+def draw_coins_and_exits(scales: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.ndarray]:
     """Coins and exits of the given pairs of scales, a coin, a closed exit and an open one for each.
 
     Their colours (R, W, W, 3), and (R, W, W) bool what is drawn of them.
@@ -501,19 +502,19 @@ def draw_props(scales: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.
     images = np.zeros((3 * len(scales), width, width, 3), np.uint8)
     solids = np.zeros(images.shape[:3], bool)
     for index, (coin_scale, exit_scale) in enumerate(scales):
-        _draw_coin(images[3 * index], solids[3 * index], coin_scale)
+        _draw_coin_sprite(images[3 * index], solids[3 * index], coin_scale)
         for look, color in enumerate((DOOR_CLOSED, DOOR_OPEN)):
-            _draw_exit(images[3 * index + 1 + look], solids[3 * index + 1 + look], exit_scale, color)
+            _draw_exit_sprite(images[3 * index + 1 + look], solids[3 * index + 1 + look], exit_scale, color)
     return images, solids
 
 
 @lru_cache(maxsize=16)
-def props(scales: tuple[tuple[float, float], ...]) -> Sheet:
+def coin_and_exit_sheet(scales: tuple[tuple[float, float], ...]) -> Sheet:
     """The sprites of these coins and exits."""
-    return make_sheet(*draw_props(scales), np.arange(SCREEN))
+    return make_sheet(*draw_coins_and_exits(scales), np.arange(SCREEN))
 
 
-def _draw_coin(image: np.ndarray, solid: np.ndarray, scale: float) -> None:
+def _draw_coin_sprite(image: np.ndarray, solid: np.ndarray, scale: float) -> None:
     middle, radius, rim = len(solid) // 2, int(10 * scale), int(2 * scale)
     solid |= disk(len(solid), middle, middle, radius)
     image[solid] = YELLOW
@@ -521,7 +522,7 @@ def _draw_coin(image: np.ndarray, solid: np.ndarray, scale: float) -> None:
     image[ring(len(solid), middle, middle, radius, rim) if rim else solid] = ORANGE
 
 
-def _draw_exit(image: np.ndarray, solid: np.ndarray, scale: float, color: tuple[int, int, int]) -> None:
+def _draw_exit_sprite(image: np.ndarray, solid: np.ndarray, scale: float, color: tuple[int, int, int]) -> None:
     size, corner, frame = int(20 * scale), int(10 * scale), int(2 * scale)
     first = len(solid) // 2 - size // 2
     square = slice(first, first + size)
@@ -551,7 +552,7 @@ class DrawingTables(NamedTuple):
 
     spots: SpotStencils
     figures: Sheet
-    props: Sheet
+    coins_and_exits: Sheet
     bars: np.ndarray
     scratch: np.ndarray  # (N, 588) scratch for pixels()
 
@@ -559,68 +560,71 @@ class DrawingTables(NamedTuple):
 def draw(s: State, drawing: DrawingTables, lanes: np.ndarray | slice) -> np.ndarray:
     """Fresh frames of the lanes, (n, 84, 84, 3) uint8, from the state alone."""
     dim = (s.length < s.dark_at)[lanes]  # (n,) the darkness is not just black
-    frames = scene(s, drawing, lanes, s.seen[lanes] | dim)
-    lit, rim = shine(s, drawing.spots, lanes)
+    frames = draw_in_full_light(s, drawing, lanes, s.near_light[lanes] | dim)
+    lit, rim = light_masks(s, drawing.spots, lanes)
     darken(s, lanes, frames, pixels(lit, drawing.scratch[: len(lit)]), rim, np.flatnonzero(dim))
-    coins = s.coin_age[lanes] < s.coin_show[lanes]
+    coins = s.coin_age[lanes] < s.coin_show_limit[lanes]
     if np.count_nonzero(coins):
-        put_coins(s, drawing, lanes, frames, coins)
+        draw_coins(s, drawing, lanes, frames, coins)
     layered = np.count_nonzero(s.layered[lanes])
     if layered:
-        put_layer(s, drawing, lanes, frames, BELOW_BAR)
+        draw_layer(s, drawing, lanes, frames, BELOW_BAR)
     frames.reshape(-1, SCREEN, ROW)[:, :BAR] = drawing.bars.take(bar_rows(s, lanes), axis=0)[:, None]
     if layered:
-        put_layer(s, drawing, lanes, frames, ABOVE_BAR)
+        draw_layer(s, drawing, lanes, frames, ABOVE_BAR)
     return frames.reshape(-1, SCREEN, SCREEN, 3)
 
 
 def bar_rows(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     """(n,) which of bars() the lanes show."""
-    return s.senses[lanes] + (3 * s.shown_action[lanes] + s.shown_gain[lanes]) * WIDTHS + s.red[lanes]
+    return s.first_bar[lanes] + (3 * s.shown_action[lanes] + s.shown_gain[lanes]) * WIDTHS + s.lost_width[lanes]
 
 
-def scene(s: State, drawing: DrawingTables, lanes: np.ndarray | slice, seen: np.ndarray | bool) -> np.ndarray:
+def draw_in_full_light(
+    s: State, drawing: DrawingTables, lanes: np.ndarray | slice, seen: np.ndarray | bool
+) -> np.ndarray:
     """The lanes in full light, with the agents that are seen, (n,) bool or just True: (n, FRAME) uint8."""
     frames = s.scenery.take(s.floor[lanes], axis=0)
-    put_agent(s, drawing, lanes, frames, seen)
+    draw_agents(s, drawing, lanes, frames, seen)
     return frames
 
 
 def draw_scenery(s: State, drawing: DrawingTables, lane: int) -> None:
     """Draws the lane's scenery, whenever a coin or the exit has changed."""
     frames, twice = floors().take(s.floors[lane], axis=0), np.array([lane, lane])
-    put_coins(s, drawing, twice, frames, True)
-    put_exit(s, drawing, twice, frames, True)
+    draw_coins(s, drawing, twice, frames, True)
+    draw_exits(s, drawing, twice, frames, True)
     s.scenery[2 * lane : 2 * lane + 2] = frames
 
 
-def put_coins(
+def draw_coins(
     s: State, drawing: DrawingTables, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool
 ) -> None:
     """Draws the coins of the lanes that are shown, (n,) bool, into the frames, in place."""
-    looks = s.props[lanes]
+    sprite = s.coin_sprite[lanes]
     for coin in range(COIN, s.bodies.shape[2]):
         pos = s.bodies[:, lanes, coin].T  # (n, 2)
-        put(frames, drawing.props, looks, pos, shown & (pos[:, 0] != GONE))
+        paste_shown(frames, drawing.coins_and_exits, sprite, pos, shown & (pos[:, 0] != GONE))
 
 
-def put_exit(
+def draw_exits(
     s: State, drawing: DrawingTables, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool
 ) -> None:
     """Draws the exits of the lanes that are shown, (n,) bool, into the frames, in place."""
     pos = s.bodies[:, lanes, EXIT].T  # (n, 2)
-    put(frames, drawing.props, (s.props + s.is_open)[lanes] + 1, pos, shown & (pos[:, 0] != GONE))
+    sprite = (s.coin_sprite + s.is_open)[lanes] + 1
+    paste_shown(frames, drawing.coins_and_exits, sprite, pos, shown & (pos[:, 0] != GONE))
 
 
-def put_agent(
+def draw_agents(
     s: State, drawing: DrawingTables, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool
 ) -> None:
     """Draws the agents of the lanes that are shown, (n,) bool, into the frames, in place."""
     if shown is True or np.count_nonzero(shown):
-        put(frames, drawing.figures, (s.figure * FACINGS + s.look)[lanes], s.pos[lanes], shown)
+        paste_shown(frames, drawing.figures, (s.figure * FACINGS + s.drawn_facing)[lanes], s.pos[lanes], shown)
 
 
-def put(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, shown: np.ndarray | bool) -> None:
+def paste_shown(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, shown: np.ndarray | bool) -> None:
     """Pastes sprite rows[i] of the sheet at pos[i] into those of the frames that are shown, (n,) bool or just True."""
     count = len(rows) if shown is True else np.count_nonzero(shown)
     if count == len(rows):
@@ -630,15 +634,15 @@ def put(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, sho
         paste(frames, sheet, rows[at], pos[at], at)
 
 
-def put_layer(s: State, drawing: DrawingTables, lanes: np.ndarray | slice, frames: np.ndarray, layer: int) -> None:
+def draw_layer(s: State, drawing: DrawingTables, lanes: np.ndarray | slice, frames: np.ndarray, layer: int) -> None:
     """Draws the exits and agents that belong to this layer, which the darkness does not cover."""
-    put_exit(s, drawing, lanes, frames, s.exit_layer[lanes] == layer)
-    put_agent(s, drawing, lanes, frames, s.agent_layer[lanes] == layer)
+    draw_exits(s, drawing, lanes, frames, s.exit_layer[lanes] == layer)
+    draw_agents(s, drawing, lanes, frames, s.agent_layer[lanes] == layer)
 
 
-def shine(s: State, tables: SpotStencils, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
+def light_masks(s: State, tables: SpotStencils, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
     """What the spotlights light and, if any has a rim, which pixels those are: masks, (n, 588) uint16."""
-    key = s.place[:, lanes, : int(s.count.max())].transpose(0, 2, 1).copy()  # (2, S, n)
+    key = s.spot_place[:, lanes, : int(s.num_spots.max())].transpose(0, 2, 1).copy()  # (2, S, n)
     lit, rim = overlay(tables.disks.at(*key), tables.rims, key, s.rim[lanes])
     return lit.view(np.uint16), None if rim is None else rim.view(np.uint16)
 
@@ -710,7 +714,7 @@ DUSK = ((1 - np.arange(256) / 255) * (VEIL[:, 1] > VEIL[:, 0])).astype(np.float3
 
 @cache
 def readings(endless: bool) -> np.ndarray:
-    """(4 * SENSES, 8) float32, read-only: what each of bars() says."""
+    """(4 * BARS_PER_CHOICE, 8) float32, read-only: what each of bars() says."""
     table = read_bars(bars(endless).reshape(-1, SCREEN, 3))
     table.flags.writeable = False
     return table
@@ -740,7 +744,7 @@ class VectorTables(NamedTuple):
     key: np.ndarray  # (K + 1, N) where the lanes' bodies are in those tables, and then the exit's door
     bodies: np.ndarray  # (K + 1,) their numbers in State.bodies. Without exits there is no door: both are (K, ...) then
     coin: int  # which of the bodies is the first coin
-    handed: np.ndarray  # (N,) bool: the agent has hands, which show its facing
+    has_hands: np.ndarray  # (N,) bool: the agent has hands, which show its facing
 
 
 @lru_cache(maxsize=16)
@@ -750,7 +754,7 @@ def vector_shapes(
     """VectorTables' shapes, rims and high. Cached: environments with equal options share them."""
     disks, rims = spot_shapes(least, largest)
     figures = [solid for scale in figure_scales for solid in sprites(scale)[1]]
-    images, solids = draw_props(scales)
+    images, solids = draw_coins_and_exits(scales)
     # An exit's frame is as black as the dark, so what can be seen of it is its door.
     things = [each for i in range(0, len(solids), 3) for each in (*solids[i : i + 2], images[i + 1].any(axis=-1))]
     shapes = disks + figures + things
@@ -773,26 +777,26 @@ class FrameSamples(NamedTuple):
     floor: np.ndarray  # what nothing covers
 
 
-def describe(s: State, g: VectorTables, lanes: np.ndarray | slice) -> np.ndarray:
+def make_vectors(s: State, g: VectorTables, lanes: np.ndarray | slice) -> np.ndarray:
     """The vectors of the lanes, (n, V) float32, from the state alone. No frame is drawn.
 
     They are made of the colours of the bar and of every third pixel below it, so that equal frames have equal vectors.
     """
     sampled = sample_frames(s, g, lanes)
     out = np.zeros((len(sampled.lit), g.width), np.float32)
-    describe_bar(s, g, lanes, sampled, out)
-    describe_rest(s, g, lanes, sampled, out)
+    write_bar(s, g, lanes, sampled, out)
+    write_rest(s, g, lanes, sampled, out)
     return out
 
 
 def sample_frames(s: State, g: VectorTables, lanes: np.ndarray | slice) -> FrameSamples:
     """The lanes' frames as samples."""
-    place, each = s.place[:, lanes, : int(s.count.max())], np.arange(len(s.pos))[lanes]
+    place, each = s.spot_place[:, lanes, : int(s.num_spots.max())], np.arange(len(s.pos))[lanes]
     spots, has_exit = place.shape[2], g.coin == COIN
     key = np.empty((2, spots + len(g.key), len(each)), np.int64)
     key[:, :spots] = place.transpose(0, 2, 1)
     np.add(s.bodies[:, lanes].transpose(0, 2, 1)[:, g.bodies], g.key[:, lanes], out=key[:, spots:])
-    key[:, spots + AGENT] += s.look[lanes] * PLACES
+    key[:, spots + AGENT] += s.drawn_facing[lanes] * PLACES
     shapes = g.shapes.at(*key)  # (S + K + 1, n, 42)
     lit, rim = overlay(shapes[:spots], g.rims, key[:, :spots], s.rim[lanes])
     opacity = s.darkness[each, np.minimum(s.length[lanes], FADE - 1)]
@@ -801,9 +805,9 @@ def sample_frames(s: State, g: VectorTables, lanes: np.ndarray | slice) -> Frame
     clear = lit | veil[:, 1:]
     bodies, (raised, layer) = slice(spots, -1 if has_exit else None), layers(s, g, lanes)
     cover = shapes[bodies]
-    seen, floor = uncover(cover, clear)
+    seen, floor = visible_parts(cover, clear)
     if raised.size:
-        seen[:, raised], floor[raised] = uncover_layers(cover[:, raised], clear[raised], layer)
+        seen[:, raised], floor[raised] = visible_parts_in_layers(cover[:, raised], clear[raised], layer)
     if has_exit:
         seen[EXIT] &= shapes[-1]
     return FrameSamples(opacity, lit, clear, rim, *key[:, bodies], raised, layer, cover, seen, floor)
@@ -811,7 +815,7 @@ def sample_frames(s: State, g: VectorTables, lanes: np.ndarray | slice) -> Frame
 
 def layers(s: State, g: VectorTables, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
     """FrameSamples' raised and layer."""
-    coins = s.coin_age[lanes] < s.coin_show[lanes]
+    coins = s.coin_age[lanes] < s.coin_show_limit[lanes]
     (raised,) = (coins | s.layered[lanes]).nonzero()
     if not raised.size:
         return raised, None
@@ -820,7 +824,9 @@ def layers(s: State, g: VectorTables, lanes: np.ndarray | slice) -> tuple[np.nda
     return raised, np.array([layer[raised] for layer in every])[..., None]
 
 
-def uncover(cover: np.ndarray, clear: np.ndarray, left: np.ndarray = LINES_BELOW) -> tuple[np.ndarray, np.ndarray]:
+def visible_parts(
+    cover: np.ndarray, clear: np.ndarray, left: np.ndarray = LINES_BELOW
+) -> tuple[np.ndarray, np.ndarray]:
     """What is visible of bodies and of the floor behind them, (K, n, 42) and (n, 42).
 
     cover: (K, n, 42) what the bodies cover, from front to back. clear: (n, 42). left: (42,) what nothing covers so far.
@@ -833,16 +839,16 @@ def uncover(cover: np.ndarray, clear: np.ndarray, left: np.ndarray = LINES_BELOW
     return seen, left
 
 
-def uncover_layers(cover: np.ndarray, clear: np.ndarray, layer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def visible_parts_in_layers(cover: np.ndarray, clear: np.ndarray, layer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same where some of the bodies are above the darkness, and before all others. layer: (K, n, 1)."""
     above = np.where(layer == UNDER, NO_BITS, cover)
     free = ~np.bitwise_or.reduce(above, axis=0)
-    seen_above, _ = uncover(above, np.where(layer == ABOVE_BAR, LINE, LINES_BELOW), LINE)
-    seen_below, floor = uncover(cover ^ above, clear & free)
+    seen_above, _ = visible_parts(above, np.where(layer == ABOVE_BAR, LINE, LINES_BELOW), LINE)
+    seen_below, floor = visible_parts(cover ^ above, clear & free)
     return seen_above | seen_below, floor & free
 
 
-def describe_bar(s: State, g: VectorTables, lanes: np.ndarray | slice, sampled: FrameSamples, out: np.ndarray) -> None:
+def write_bar(s: State, g: VectorTables, lanes: np.ndarray | slice, sampled: FrameSamples, out: np.ndarray) -> None:
     """Writes health, action and reward."""
     senses = bar_rows(s, lanes)
     out[:, READING] = g.readings.take(senses, axis=0)
@@ -854,7 +860,7 @@ def describe_bar(s: State, g: VectorTables, lanes: np.ndarray | slice, sampled: 
         out[high, READING] = read_bars(g.bars[senses[high]].reshape(-1, SCREEN, 3) * columns[..., None])
 
 
-def describe_rest(s: State, g: VectorTables, lanes: np.ndarray | slice, sampled: FrameSamples, out: np.ndarray) -> None:
+def write_rest(s: State, g: VectorTables, lanes: np.ndarray | slice, sampled: FrameSamples, out: np.ndarray) -> None:
     """Writes the other entries."""
     cover, seen, (bodies, n, _) = sampled.cover, sampled.seen, sampled.seen.shape
     bright, visible, dusk = sampled.lit & sampled.floor, sampled.clear & sampled.floor, DUSK.take(sampled.opacity)
@@ -869,15 +875,15 @@ def describe_rest(s: State, g: VectorTables, lanes: np.ndarray | slice, sampled:
     any_ = np.bitwise_or.reduce(lines, axis=2) != 0  # (K + 3, n)
     out[:, g.at["dusk"].start] = dusk * any_[-2]
     out[:, g.at["alarm"].start] = (s.floor & s.reddens)[lanes] * any_[-1]
-    describe_places(g, seen, any_[:bodies], out)
-    (whole,) = (any_[AGENT] & ~any_[bodies] & g.handed[lanes]).nonzero()
-    out[whole, g.at["facing"].start + s.look[lanes][whole]] = 1
+    write_places(g, seen, any_[:bodies], out)
+    (whole,) = (any_[AGENT] & ~any_[bodies] & g.has_hands[lanes]).nonzero()
+    out[whole, g.at["facing"].start + s.drawn_facing[lanes][whole]] = 1
     if "exit" in g.at:
         out[:, g.at["exit_open"].start] = s.is_open[lanes] * any_[EXIT]
-    describe_tiles(g, seen, any_[:bodies], bright, out)
+    write_tiles(g, seen, any_[:bodies], bright, out)
 
 
-def describe_places(g: VectorTables, seen: np.ndarray, any_: np.ndarray, out: np.ndarray) -> None:
+def write_places(g: VectorTables, seen: np.ndarray, any_: np.ndarray, out: np.ndarray) -> None:
     """Writes how much of the bodies is visible and where that is. any_: (K, n) whether any is."""
     (bodies, n), kinds = any_.shape, g.coin + 1
     body, lane = any_.nonzero()
@@ -893,7 +899,7 @@ def describe_places(g: VectorTables, seen: np.ndarray, any_: np.ndarray, out: np
     out[:, g.places].reshape(n, kinds, 3)[lane, body] = total
 
 
-def describe_tiles(g: VectorTables, seen: np.ndarray, any_: np.ndarray, bright: np.ndarray, out: np.ndarray) -> None:
+def write_tiles(g: VectorTables, seen: np.ndarray, any_: np.ndarray, bright: np.ndarray, out: np.ndarray) -> None:
     """Writes which share of each tile shows light and coins (not in the endless id). any_: (K, n) whether any shows."""
     if "coins" not in g.at:
         out[:, g.at["light"]] = tile_counts(bright) * TILE_SHARE
@@ -925,7 +931,7 @@ def spot_places(spots: np.ndarray) -> np.ndarray:
     return place
 
 
-def retire(s: State) -> tuple[np.ndarray, np.ndarray]:
+def remove_finished(s: State) -> tuple[np.ndarray, np.ndarray]:
     """Removes the spotlights that are through: lanes and slots, each (n,), of those that pause for this step.
 
     The original removes them from the list that it is walking, so the one behind each is skipped: it neither moves nor
@@ -934,7 +940,7 @@ def retire(s: State) -> tuple[np.ndarray, np.ndarray]:
     lanes, slots = [], []
     for lane in np.flatnonzero((s.spots[TIME] >= 1.0).any(axis=1)).tolist():
         through = s.spots[TIME, lane] >= 1.0
-        kept, pausing, at = list(range(int(s.count[lane]))), [], 0
+        kept, pausing, at = list(range(int(s.num_spots[lane]))), [], 0
         while at < len(kept):
             if through[kept[at]]:
                 del kept[at]
@@ -943,18 +949,18 @@ def retire(s: State) -> tuple[np.ndarray, np.ndarray]:
         left = len(kept)
         s.spots[:, lane, :left], s.spot_key[lane, :left] = s.spots[:, lane, kept], s.spot_key[lane, kept]
         s.spots[:, lane, left:], s.spot_key[lane, left:] = NO_SPOT[:, None], NO_KEY
-        s.count[lane] = left
+        s.num_spots[lane] = left
         slots += [kept.index(each) for each in pausing]
         lanes += [lane] * len(pausing)
     return np.array(lanes, np.intp), np.array(slots, np.intp)
 
 
-def burn(s: State, lanes: np.ndarray) -> np.ndarray:
+def take_damage(s: State, lanes: np.ndarray) -> np.ndarray:
     """Damages the agents of these lanes; (n,) bool whose health is gone."""
     s.health[lanes] -= s.damage[lanes]
     s.floor[lanes] += 1
-    lost = 1 - s.health[lanes] / s.full[lanes]
-    s.red[lanes] = np.minimum(SCREEN // 2 * lost, SCREEN)  # cut off to whole pixels
+    lost = 1 - s.health[lanes] / s.full_health[lanes]
+    s.lost_width[lanes] = np.minimum(SCREEN // 2 * lost, SCREEN)  # cut off to whole pixels
     return s.health[lanes] <= 0
 
 
@@ -967,10 +973,10 @@ def take_coins(s: State, lane: int, touched: np.ndarray) -> int:
         elif touched[coin]:
             s.bodies[:, lane, coin] = GONE
             taken, skip = taken + 1, True
-    s.left[lane] -= taken
-    s.is_open[lane] = s.left[lane] == 0
+    s.coins_left[lane] -= taken
+    s.is_open[lane] = s.coins_left[lane] == 0
     s.collected[lane] += taken
-    aim(s, lane)
+    update_targets(s, lane)
     return taken
 
 
@@ -1021,7 +1027,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
 
     variants = VARIANTS
     tables = ("_agent_tables", "_drawing", "_vector_tables")
-    growing = ("bodies", "touch", "spots", "spot_key", "place")
+    growing = ("bodies", "touch_squared", "spots", "spot_key", "spot_place")
     kept = (*MemoryGymVectorEnv.kept, "_unlocked")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
@@ -1031,7 +1037,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
     def allocate(self) -> None:
         """Makes the state of N lanes."""
         self.state = empty_state(self.num_envs)
-        self._settle()
+        self._number_sprites()
         self._unlocked: list[int] = []  # lanes without coins, whose exits open in the first step
         self.place_tables()
 
@@ -1041,17 +1047,17 @@ class SearingSpotlights(MemoryGymVectorEnv):
         make_room(s, coins=1 if endless else max((1, *values["num_coins"])))
         for field, name in RULES.items():
             getattr(s, field)[lanes] = values.get(name, 0)
-        s.limit[lanes] = _limit(values["max_steps"])
+        s.step_limit[lanes] = _limit(values["max_steps"])
         s.coin_limit[lanes] = _limit(values["steps_per_coin"] if endless and values["coin_enabled"] else -1)
-        s.coin_show[lanes] = NO_LIMIT if values["coins_visible"] else _limit(values.get("coin_show_duration", 0))
+        s.coin_show_limit[lanes] = NO_LIMIT if values["coins_visible"] else _limit(values.get("coin_show_duration", 0))
         waits = ("spawn_interval",) if endless else ("initial_spawn_interval", "spawn_interval_threshold")
-        s.interval[lanes] = max(1, sum(values[name] for name in waits))
+        s.spawn_interval[lanes] = max(1, sum(values[name] for name in waits))
         radius = radius_of(values["agent_scale"])
         coin, exit_ = int(10 * values["coin_scale"]), 10 * values.get("exit_scale", 0.0)
-        s.touch[lanes, COIN:], s.touch[lanes, EXIT] = (coin + radius) ** 2, (exit_ + radius) ** 2
-        s.touch[lanes, AGENT] = -1.0
+        s.touch_squared[lanes, COIN:], s.touch_squared[lanes, EXIT] = (coin + radius) ** 2, (exit_ + radius) ** 2
+        s.touch_squared[lanes, AGENT] = -1.0
         self._configure_pictures(lanes, values)
-        self._settle()
+        self._number_sprites()
         self.place_tables()
 
     def _configure_pictures(self, lanes: np.ndarray, values: dict[str, Any]) -> None:
@@ -1066,20 +1072,20 @@ class SearingSpotlights(MemoryGymVectorEnv):
         s.dark_at[lanes] = opaque[0] if opaque.size and not values["black_background"] else NO_LIMIT
         s.reddens[lanes] = s.floors[lanes[0], 1] == RED_FLOOR
         shown = values["show_last_action"] + 2 * values["show_last_positive_reward"]
-        s.senses[lanes] = shown * SENSES
+        s.first_bar[lanes] = shown * BARS_PER_CHOICE
         exit_, coins = values.get("exit_visible", False), values["coins_visible"]
         # The original inserts the surfaces at places in a list that depend on each other.
         s.exit_layer[lanes] = (BELOW_BAR if coins else ABOVE_BAR) if exit_ else UNDER
         s.agent_layer[lanes] = (BELOW_BAR if coins and exit_ else ABOVE_BAR) if values["agent_visible"] else UNDER
         s.layered[lanes] = exit_ or values["agent_visible"]
 
-    def _settle(self) -> None:
-        """Numbers the different figures and props of all lanes' options."""
+    def _number_sprites(self) -> None:
+        """Numbers the different figures, coins and exits of all lanes' options."""
         figures, scales = zip(*((_figures(each), _scales(each)) for each in self.settings), strict=True)
         self.figures, self.scales = tuple(dict.fromkeys(figures)), tuple(dict.fromkeys(scales))
         # Each figure is there twice: the bar makes the ground less high than it is wide.
         self.state.figure[:] = [2 * self.figures.index(figure) for figure in figures]
-        self.state.props[:] = [3 * self.scales.index(scale) for scale in scales]
+        self.state.coin_sprite[:] = [3 * self.scales.index(scale) for scale in scales]
 
     def place_tables(self) -> None:
         """The tables that step() looks things up in, and where each lane's rows start in them."""
@@ -1088,7 +1094,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         radii, endless = (int(min(radii)), int(max(radii))), self.variant.endless
         scratch = pixel_scratch(self.num_envs)
         self._drawing = DrawingTables(
-            spot_stencils(*radii), self._agent_tables.sheet, props(self.scales), bars(endless), scratch
+            spot_stencils(*radii), self._agent_tables.sheet, coin_and_exit_sheet(self.scales), bars(endless), scratch
         )
         if self.obs_type == "vector":
             self._vector_tables = self._make_vector_tables(*radii)
@@ -1100,7 +1106,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         """The tables that vectors are made of, for spotlights of these radii."""
         s, figures = self.state, tuple(across.scale for across, _ in self.figures)
         coins = s.bodies.shape[2] - COIN
-        first = largest + 1 + len(figures) * FACINGS + s.props  # (N,) the coin, before the exit and the door
+        first = largest + 1 + len(figures) * FACINGS + s.coin_sprite  # (N,) the coin, before the exit and the door
         key = [largest + 1 + s.figure // 2 * FACINGS, first + 1, *[first] * coins, first + 2]
         bodies = [AGENT, EXIT, *range(COIN, COIN + coins), EXIT]
         if self.variant.endless:
@@ -1119,7 +1125,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
             key=np.stack(key) * PLACES + PLACE_0,
             bodies=np.array(bodies),
             coin=1 if self.variant.endless else COIN,
-            handed=np.array([int(10 * values["agent_scale"]) > 0 for values in self.settings]),
+            has_hands=np.array([int(10 * values["agent_scale"]) > 0 for values in self.settings]),
         )
 
     def begin(self, lanes: np.ndarray) -> None:
@@ -1140,22 +1146,22 @@ class SearingSpotlights(MemoryGymVectorEnv):
         self._move(actions)
         while self._unlocked:
             lane = self._unlocked.pop()
-            s.is_open[lane] = s.left[lane] == 0
+            s.is_open[lane] = s.coins_left[lane] == 0
             self._draw_scenery(lane)
-        s.wait -= 1
-        due = s.wait == 0
+        s.spawn_wait -= 1
+        due = s.spawn_wait == 0
         if np.count_nonzero(due):
             for lane in np.flatnonzero(due).tolist():
                 self._spawn(lane)
-        hit = self._shine()
+        hit = self._move_spots()
         rewards, terminated, s.floor = s.reward_outside.copy(), np.zeros(self.num_envs, bool), self._calm.copy()
         if np.count_nonzero(hit):
             lanes = np.flatnonzero(hit)
-            terminated[lanes] = dead = burn(s, lanes)
+            terminated[lanes] = dead = take_damage(s, lanes)
             rewards[lanes] = s.reward_inside[lanes] + s.reward_death[lanes] * dead
         gap = s.bodies - s.bodies[:, :, :1]  # (2, N, B)
         gap *= gap
-        touched = gap[0] + gap[1] <= s.touch
+        touched = gap[0] + gap[1] <= s.touch_squared
         if np.count_nonzero(touched):
             self._collect(touched, rewards)
             if not self.variant.endless:
@@ -1167,22 +1173,22 @@ class SearingSpotlights(MemoryGymVectorEnv):
         action = actions[:, 0] * 3 + actions[:, 1]  # (N,)
         s.shown_action, s.last_action = s.last_action, action
         s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._agent_tables.walk)
-        s.look = s.facing
+        s.drawn_facing = s.facing
         np.subtract(s.pos.T, PAD, out=s.bodies[:, :, AGENT])
 
     def _spawn(self, lane: int) -> None:
         """Adds a spotlight to the lane's, if there is room."""
         s = self.state
-        if s.count[lane] < MOST_SPOTS:
+        if s.num_spots[lane] < MOST_SPOTS:
             add_spot(s, lane, sample_spot(self._rngs[lane], self.settings[lane]))
-        s.spawns[lane] -= 1
+        s.spawns_left[lane] -= 1
         # Always the first interval of the original's list, as its spawns remove the last one.
-        s.wait[lane] = s.interval[lane] if s.spawns[lane] else NO_LIMIT
+        s.spawn_wait[lane] = s.spawn_interval[lane] if s.spawns_left[lane] else NO_LIMIT
 
-    def _shine(self) -> np.ndarray:
+    def _move_spots(self) -> np.ndarray:
         """Moves the spotlights on; (N,) bool whose agent is in the light."""
         s = self.state
-        pausing = retire(s) if np.count_nonzero(s.spots[TIME] >= 1.0) else None
+        pausing = remove_finished(s) if np.count_nonzero(s.spots[TIME] >= 1.0) else None
         time = s.spots[TIME]  # (N, S)
         spot = spot_places(s.spots)  # (2, N, S)
         place = spot.astype(np.int64)
@@ -1196,8 +1202,8 @@ class SearingSpotlights(MemoryGymVectorEnv):
             held = time[pausing]
             time += s.spots[SPEED]
             time[pausing], distance[pausing], place[(ALL, *pausing)] = held, np.inf, 0
-        s.place, s.seen = place, (distance <= s.spots[SIGHT]).any(axis=1)
-        return (distance <= s.spots[REACH]).any(axis=1) if np.count_nonzero(s.seen) else s.seen
+        s.spot_place, s.near_light = place, (distance <= s.spots[SIGHT]).any(axis=1)
+        return (distance <= s.spots[REACH]).any(axis=1) if np.count_nonzero(s.near_light) else s.near_light
 
     def _collect(self, touched: np.ndarray, rewards: np.ndarray) -> None:
         """Takes the coins that are touched, (N, B) bool; the endless id then has a new one."""
@@ -1207,15 +1213,15 @@ class SearingSpotlights(MemoryGymVectorEnv):
             rewards[lane] += s.reward_coin[lane] * take_coins(s, lane, touched[lane])
             if self.variant.endless:
                 s.bodies[:, lane, COIN] = sample_coin(words(self._rngs[lane]), last)
-                s.left[lane], s.coin_age[lane] = 1, 0
-                aim(s, lane)
+                s.coins_left[lane], s.coin_age[lane] = 1, 0
+                update_targets(s, lane)
             self._draw_scenery(lane)
 
     def _leave(self, touched: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
         """Ends the episodes whose agent stands at the open exit or, without one, has just taken the last coin."""
         s = self.state
         has_exit = s.bodies[0, :, EXIT] != GONE
-        done = (s.left == 0) & np.where(has_exit, touched[:, EXIT], s.coins > 0)
+        done = (s.coins_left == 0) & np.where(has_exit, touched[:, EXIT], s.num_coins > 0)
         rewards += s.reward_exit * (done & has_exit)
         s.success[:] = done & ~terminated
         terminated |= done
@@ -1227,8 +1233,8 @@ class SearingSpotlights(MemoryGymVectorEnv):
             s.coin_age += 1
             terminated |= s.coin_age == s.coin_limit
         s.shown_gain, s.last_gain = s.last_gain, (rewards > 0) + 1
-        s.returned += rewards
-        return (s.length == s.limit) & ~terminated
+        s.episode_return += rewards
+        return (s.length == s.step_limit) & ~terminated
 
     def _draw_scenery(self, lane: int) -> None:
         """Draws the lane's scenery again, unless nothing but frames() needs it."""
@@ -1244,36 +1250,37 @@ class SearingSpotlights(MemoryGymVectorEnv):
 
     def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32: see VARIANTS[id].entries."""
-        return describe(self.state, self._vector_tables, lanes)
+        return make_vectors(self.state, self._vector_tables, lanes)
 
     def ground_truth(self) -> np.ndarray:
         """A fresh (N, 6), or (N, 4) in the endless id: the agent's, the coin's and the exit's x and y, over 84."""
         s = self.state
         truth = np.empty((self.num_envs, 4 if self.variant.endless else 6))
         truth[:, :2] = s.bodies[:, :, AGENT].T
-        truth[:, 2:] = s.goal[:, : truth.shape[1] - 2]
+        truth[:, 2:] = s.targets[:, : truth.shape[1] - 2]
         truth /= SCREEN
         return truth
 
     def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
         """The lanes' ended episodes in numbers."""
         s = self.state
-        numbers = {"reward": s.returned[lanes], "length": s.length[lanes], "agent_health": (s.health / s.full)[lanes]}
+        numbers = {"reward": s.episode_return[lanes], "length": s.length[lanes]}
+        numbers["agent_health"] = (s.health / s.full_health)[lanes]
         if self.variant.endless:
             return numbers | {"coins_collected": s.collected[lanes]}
-        coins = s.coins[lanes]
+        coins = s.num_coins[lanes]
         share = np.where(coins > 0, s.collected[lanes] / np.maximum(coins, 1), 1.0)
         return numbers | {"coins_collected": share, "success": s.success[lanes]}
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Lights everything below the bar, and circles the spotlights."""
         s, lanes = self.state, np.array([lane])
-        lit = scene(s, self._drawing, lanes, True)
+        lit = draw_in_full_light(s, self._drawing, lanes, True)
         below = slice(BAR * DEBUG_ZOOM, None)
         frame[below] = magnify(lit.reshape(SCREEN, SCREEN, 3), DEBUG_ZOOM)[below]
-        for slot in np.flatnonzero(s.place[0, lane]).tolist():
+        for slot in np.flatnonzero(s.spot_place[0, lane]).tolist():
             radius = int(s.spots[RADIUS, lane, slot])
-            x, y = (s.place[:, lane, slot] - radius * PLACES - PLACE_0).tolist()
+            x, y = (s.spot_place[:, lane, slot] - radius * PLACES - PLACE_0).tolist()
             circle = ring(len(frame), x * DEBUG_ZOOM, y * DEBUG_ZOOM, radius * DEBUG_ZOOM, DEBUG_ZOOM)
             circle[: BAR * DEBUG_ZOOM] = False
             frame[circle] = GREEN
@@ -1281,7 +1288,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
 
 # What the rules take over from the options as it is.
 RULES = {
-    "full": "agent_health",
+    "full_health": "agent_health",
     "damage": "spot_damage",
     "reward_inside": "reward_inside_spotlight",
     "reward_outside": "reward_outside_spotlight",

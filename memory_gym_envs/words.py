@@ -1,6 +1,6 @@
 """Random integers faster than from NumPy's generator, and the same: it makes them of the words of its bit generator.
 
-A word has 32 bits. `words` draws one at a time, `Tape` reads many ahead.
+A word has 32 bits. `words` draws one at a time, `WordBuffer` reads many ahead.
 """
 
 from collections.abc import Callable
@@ -35,7 +35,7 @@ def pick(word: Callable[[], int], values: tuple[int, ...]) -> int:
     return values[below(word, len(values))]
 
 
-class Tape:
+class WordBuffer:
     """A generator's next words, read ahead. At the end, `close` leaves it as if it had drawn the used ones only.
 
     Words are the halves of a bit generator's 64-bit numbers, the lower half first. It keeps the upper half of the last
@@ -55,14 +55,14 @@ class Tape:
     def load(self, data: bytes) -> None:
         """Takes over the words."""
         self.words = memoryview(data).cast("I")
-        self.eighths = data[3::4].translate(EIGHTHS)  # what below(tape, 8) would make of each
+        self.eighths = data[3::4].translate(EIGHTHS)  # what below(buffer, 8) would make of each
 
     def __call__(self) -> int:
         """The next word."""
         self.used += 1
         return self.words[self.used - 1]
 
-    def hits(self, things: list[int], percent: int) -> list[int]:
+    def sample_each(self, things: list[int], percent: int) -> list[int]:
         """Those things that are hit: for each, a number below 100 is drawn, which must be below percent."""
         drawn = self.words[self.used : self.used + len(things)].tolist()
         if not PERCENT_AGAIN.isdisjoint(drawn):
@@ -71,9 +71,9 @@ class Tape:
         limit = -(-percent * WORDS // 100)  # of the words that make such a number
         return [thing for thing, word in zip(things, drawn, strict=True) if word < limit]
 
-    def picks(self, things: list[int], count: int) -> list[int]:
+    def take_random(self, things: list[int], count: int) -> list[int]:
         """Takes so many out of the list, one by one, or all if there are fewer."""
-        drawn, used, picked = self.words, self.used, []
+        drawn, used, taken = self.words, self.used, []
         # The last of all is taken without a draw.
         for limit in range(len(things), max(len(things) - count, 1), -1):
             product = drawn[used] * limit
@@ -81,9 +81,9 @@ class Tape:
             while product & LOW < limit and product & LOW < WORDS % limit:
                 product = drawn[used] * limit
                 used += 1
-            picked.append(things.pop(product >> 32))
+            taken.append(things.pop(product >> 32))
         self.used = used
-        return picked if len(picked) == count else picked + things
+        return taken if len(taken) == count else taken + things
 
     def close(self) -> None:
         """Sets the generator back, and draws the used words."""

@@ -24,7 +24,7 @@ from memory_gym_envs.searing_spotlights import (
     TIME,
     VARIANTS,
     SearingSpotlights,
-    shine,
+    light_masks,
     spot_places,
     spot_stencils,
 )
@@ -343,7 +343,7 @@ class SpotlightPerturbation(PictureWrapper):
         self._light.restart(lanes, [None] * self.num_envs, self._settings)
         s = self._light.state
         s.spots[TIME, lanes] = HEAD_START
-        s.place[:, lanes] = spot_places(s.spots[:, lanes]).astype(np.int64) + s.spot_key[lanes]
+        s.spot_place[:, lanes] = spot_places(s.spots[:, lanes]).astype(np.int64) + s.spot_key[lanes]
         s.spots[TIME, lanes] += s.spots[SPEED, lanes]
 
     def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
@@ -353,7 +353,7 @@ class SpotlightPerturbation(PictureWrapper):
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
         """The lanes' observations, with the veil wherever no spotlight is."""
         frames = self.picture(observations).reshape(-1, FRAME)  # (n, FRAME)
-        bits, _ = shine(self._light.state, spot_stencils(*self._radii), lanes)
+        bits, _ = light_masks(self._light.state, spot_stencils(*self._radii), lanes)
         veiled = frames * self.clear
         veiled += self.veil
         veiled //= np.uint16(255)

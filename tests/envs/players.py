@@ -21,7 +21,7 @@ def choices(env) -> int:
 def free_player(batch) -> np.ndarray:
     """(N, 2) actions towards the middle of each lane's target tile, on a torus the short way."""
     s = batch.state
-    away = s.goal + TILE // 2 - s.pos  # (N, 2)
+    away = s.target_corner + TILE // 2 - s.pos  # (N, 2)
     if batch.variant.endless:
         away = (away + SCREEN // 2) % SCREEN - SCREEN // 2
     return np.where(away > 2, 2, np.where(away < -2, 1, 0))
@@ -30,7 +30,7 @@ def free_player(batch) -> np.ndarray:
 def grid_player(batch) -> np.ndarray:
     """(N,) actions: turn the short way towards the target, first along x, then walk."""
     s = batch.state
-    away = (s.goal + TILE // 2 - s.pos) // TILE  # (N, 2) tiles
+    away = (s.target_corner + TILE // 2 - s.pos) // TILE  # (N, 2) tiles
     along_x = away[:, 0] != 0
     wanted = np.where(along_x, np.where(away[:, 0] > 0, 6, 2), np.where(away[:, 1] > 0, 4, 0))
     return np.where((away == 0).all(axis=1), 0, turn_or_walk(s.facing, wanted))
@@ -44,15 +44,15 @@ def turn_or_walk(facing: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 def path_grid_player(batch) -> np.ndarray:
     """(N,) actions to the path's next tile."""
     s = batch.state
-    heading = s.heading_at[np.arange(batch.num_envs), s.at]
+    heading = s.direction_at[np.arange(batch.num_envs), s.last_path_step]
     return turn_or_walk(s.facing, np.array([6, 0, 4, 2])[heading])
 
 
 def path_free_player(batch) -> np.ndarray:
     """(N, 2) actions to the path's next tile: first to the middle of the way there, then along it."""
     s, lanes = batch.state, np.arange(batch.num_envs)
-    away = tile_centres(s.cell[lanes, np.minimum(s.at + 1, s.count)]) - s.pos  # (N, 2)
-    along_x = np.isin(s.heading_at[lanes, s.at], (EAST, WEST))
+    away = tile_centres(s.path_cell[lanes, np.minimum(s.last_path_step + 1, s.path_length)]) - s.pos  # (N, 2)
+    along_x = np.isin(s.direction_at[lanes, s.last_path_step], (EAST, WEST))
     aside = np.abs(np.where(along_x, away[:, 1], away[:, 0])) > 2
     both = np.where(away > 2, 2, np.where(away < -2, 1, 0))
     return both * np.stack([along_x != aside, along_x == aside], axis=1)

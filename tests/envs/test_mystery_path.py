@@ -10,11 +10,11 @@ from players import player, stumbling, turn_or_walk
 from memory_gym_envs import MysteryPath
 from memory_gym_envs.character import BODY, PAD
 from memory_gym_envs.mystery_path import (
-    BEYOND,
     EAST,
     FIRST_SEGMENTS,
     NORTH,
     PIT,
+    PIT_ROWS,
     ROWS,
     SEGMENT,
     SIDE,
@@ -40,8 +40,8 @@ def made(env_id, seed=0, **options):
 
 def path_of(state, lane=0):
     """The path as (column, row) tiles."""
-    cells = state.cell[lane, 1 : state.count[lane] + 1]
-    return list(zip((cells // ROWS).tolist(), (cells % ROWS - BEYOND).tolist(), strict=True))
+    cells = state.path_cell[lane, 1 : state.path_length[lane] + 1]
+    return list(zip((cells // ROWS).tolist(), (cells % ROWS - PIT_ROWS).tolist(), strict=True))
 
 
 def has(frame, color):
@@ -63,7 +63,7 @@ def test_paths_lead_to_the_opposite_side(env_id, side):
         assert all(0 <= x < SIDE and 0 <= y < SIDE for x, y in path)
         check_path(s, path)
         assert s.walls[0].any()
-        assert not s.walls[0, s.cell[0, 1 : len(path) + 1]].any()
+        assert not s.walls[0, s.path_cell[0, 1 : len(path) + 1]].any()
         ends.add((path[0], path[-1]))
         lengths.add(len(path))
     assert len(ends) > 20
@@ -76,9 +76,9 @@ def check_path(s, path):
     assert len(set(path)) == len(path)
     moves = [(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(path)]
     directions = {(1, 0): EAST, (0, -1): NORTH, (0, 1): SOUTH, (-1, 0): WEST}
-    assert s.heading_at[0, 1 : len(path)].tolist() == [directions[move] for move in moves]
+    assert s.direction_at[0, 1 : len(path)].tolist() == [directions[move] for move in moves]
     assert np.count_nonzero(s.step_at[0]) == len(path)
-    assert [s.step_at[0, x * ROWS + BEYOND + y] for x, y in path] == list(range(1, len(path) + 1))
+    assert [s.step_at[0, x * ROWS + PIT_ROWS + y] for x, y in path] == list(range(1, len(path) + 1))
 
 
 def test_endless_paths_are_joined_by_transition_tiles():
@@ -91,14 +91,14 @@ def test_endless_paths_are_joined_by_transition_tiles():
         joints = [x for x, _ in path if x % SEGMENT == SIDE]
         assert joints == [SIDE, SEGMENT + SIDE, 2 * SEGMENT + SIDE]  # one tile each
         assert path[-1][0] == joints[-1]
-        assert s.heading_at[0, s.count[0]] == EAST
+        assert s.direction_at[0, s.path_length[0]] == EAST
 
 
 def further(rng, *arguments):
     """The endless path's next segments from this generator."""
-    tape = read_ahead(rng, FIRST_SEGMENTS)
-    level = sample_segments(tape, *arguments)
-    tape.close()
+    buffer = read_ahead(rng, FIRST_SEGMENTS)
+    level = sample_segments(buffer, *arguments)
+    buffer.close()
     return level
 
 
@@ -111,12 +111,12 @@ def test_endless_path_grows_when_its_last_segment_is_entered():
         *_, over, _, _ = env.step(player(env.batch)[0])
         assert not over
         if s.tile[0, 0] == (segments - 1) * SEGMENT and s.segments[0] > segments:
-            row = level.path[-1] % ROWS - BEYOND
+            row = level.path[-1] % ROWS - PIT_ROWS
             level.path.extend(further(rng, row, segments, 1).path)
         else:
             assert (s.segments[0], env.batch.np_random[0].bit_generator.state) == (segments, state)
     assert s.segments[0] > 8
-    assert s.cell[0, 1 : s.count[0] + 1].tolist() == level.path
+    assert s.path_cell[0, 1 : s.path_length[0] + 1].tolist() == level.path
     check_path(s, path_of(s))
 
 
@@ -128,7 +128,7 @@ def step_into_the_pit(env, s):
     down = 3 if env.batch.variant.endless else [0, 2]
     for steps in range(1, 400):
         column, row = s.tile[0].tolist()
-        if row == SIDE - 1 or s.step_at[0, column * ROWS + BEYOND + row + 1] != PIT:
+        if row == SIDE - 1 or s.step_at[0, column * ROWS + PIT_ROWS + row + 1] != PIT:
             result = env.step(player(env.batch)[0])
         else:
             result = env.step(turn_or_walk(s.facing, 4)[0] if env.batch.variant.grid else down)
@@ -146,7 +146,7 @@ def test_falling_off(env_id, feedback):
     assert not terminated
     assert reward == -0.75
     assert has(frame, RED) == feedback
-    at = int(s.at[0])
+    at = int(s.last_path_step[0])
     # Back at the origin, whatever the action.
     facing = int(s.facing[0])
     action = 3 if env.action_space.shape == () else [2, 2]
@@ -155,10 +155,10 @@ def test_falling_off(env_id, feedback):
     assert s.pos[0].tolist() == origin
     assert s.facing[0] == facing
     assert not has(frame, RED)
-    assert info["ground_truth"].argmax() == s.heading_at[0, 1]
-    assert (s.fails[0], s.at[0]) == (1, 1)
+    assert info["ground_truth"].argmax() == s.direction_at[0, 1]
+    assert (s.fails[0], s.last_path_step[0]) == (1, 1)
     # The way back earns nothing.
-    while s.at[0] < at:
+    while s.last_path_step[0] < at:
         assert env.step(player(env.batch)[0])[1] == -0.25
 
 
@@ -232,16 +232,16 @@ def test_stamina_runs_out(stamina):
 
 def test_new_tiles_and_falls_give_stamina_back():
     env, s = made(ENDLESS, 0, stamina_level=20)
-    while s.at[0] == 1:
+    while s.last_path_step[0] == 1:
         env.step(player(env.batch)[0])
     assert s.stamina[0] == 19
     step_into_the_pit(env, s)
     assert s.stamina[0] == 19
     env.step(0)
-    assert (s.at[0], s.stamina[0]) == (1, 19)
+    assert (s.last_path_step[0], s.stamina[0]) == (1, 19)
     env.step(0)
     assert s.stamina[0] == 18
-    while s.at[0] == 1:  # a tile that was reached before the fall
+    while s.last_path_step[0] == 1:  # a tile that was reached before the fall
         env.step(player(env.batch)[0])
     assert s.stamina[0] == 19
 
@@ -266,7 +266,7 @@ def test_falling_off_before_the_best_progress_ends_the_episode():
     while not s.fallen[0]:
         _, _, terminated, _, _ = env.step(2)  # up, off the path or the screen
     assert not terminated
-    assert s.furthest[0] == 4
+    assert s.max_column[0] == 4
     env.step(0)
     while not s.fallen[0]:
         *_, terminated, _, info = env.step(2)
@@ -278,12 +278,12 @@ def test_falling_off_before_the_best_progress_ends_the_episode():
 def test_ground_truth_skips_the_west(seed):
     """Where the endless path goes left, which few do, the direction before stays, and the player cannot go on."""
     env, s = made(ENDLESS, seed)
-    assert WEST in s.heading_at[0, 1 : s.count[0]]
+    assert WEST in s.direction_at[0, 1 : s.path_length[0]]
     truth, terminated = env.batch.ground_truth()[0], False
     while not terminated:
         before = truth
         *_, terminated, _, info = env.step(player(env.batch)[0])
-        truth, heading = info["ground_truth"], int(s.heading_at[0, s.at[0]])
+        truth, heading = info["ground_truth"], int(s.direction_at[0, s.last_path_step[0]])
         assert np.array_equal(truth, before if heading == WEST else np.eye(3)[heading])
     assert heading == WEST
     assert (info["num_fails"], s.stamina[0]) == (0, 0)
@@ -294,7 +294,7 @@ def test_ground_truth_of_finite_paths(env_id):
     env, s = made(env_id, 5)
     terminated, seen = False, set()
     while not terminated:
-        path, at = path_of(s), int(s.at[0])
+        path, at = path_of(s), int(s.last_path_step[0])
         truth = env.batch.ground_truth()[0]
         assert truth.sum() == 1
         move = tuple(np.subtract(path[at], path[at - 1]).tolist())
@@ -342,8 +342,8 @@ def test_past_path(camera):
         owner, cells = trail(s, lanes, envs._lane_path)
         for lane in lanes.tolist():
             expected, left = [], max(0, int(s.tile[lane, 0]) - 1 - int(camera))
-            for step in range(int(s.at[lane]) - 1, 0, -1):
-                expected.append(int(s.cell[lane, step]))
+            for step in range(int(s.last_path_step[lane]) - 1, 0, -1):
+                expected.append(int(s.path_cell[lane, step]))
                 if expected[-1] // ROWS <= left:
                     break
             assert cells[owner == lane].tolist() == expected
@@ -384,7 +384,7 @@ def test_debug_render_shows_the_path(env_id):
         path = path_of(s)
         kinds = {place: BLUE if place[0] % SEGMENT == SIDE else WHITE for place in path}
         kinds |= {path[0]: BLUE} | ({} if endless else {path[-1]: GREEN})
-        kinds |= {(cell // ROWS, cell % ROWS - BEYOND): RED for cell in np.flatnonzero(s.walls[0]).tolist()}
+        kinds |= {(cell // ROWS, cell % ROWS - PIT_ROWS): RED for cell in np.flatnonzero(s.walls[0]).tolist()}
         shown = 0
         for (column, row), color in kinds.items():
             x, y = 4 * (column * TILE - offset), 4 * row * TILE

@@ -97,10 +97,10 @@ def test_walking_into_the_fire(env_id):
     env = gym.make(env_id).unwrapped
     options = {"reward_command_failure": -0.5, "explosion_duration": [40]}
     env.reset(seed=3, options=options)
-    while not env.batch.state.lit[0]:
+    while not env.batch.state.burning[0]:
         _, _, terminated, _, _ = env.step(player(env.batch)[0])
     assert not terminated
-    x, y = (env.batch.state.goal[0] + 7 - env.batch.state.pos[0]).tolist()
+    x, y = (env.batch.state.target_corner[0] + 7 - env.batch.state.pos[0]).tolist()
     assert abs(x) <= 2
     assert abs(y) <= 2
     rng = np.random.default_rng(0)
@@ -173,7 +173,7 @@ def test_player_walks_the_path(env_id, seed):
     options = {"reward_path_progress": 0.1, "reward_fall_off": -5.0}
     rewards, terminated, truncated, info = play_out(env, lambda: player(env.batch)[0], seed, options)
     s = env.batch.state
-    headings = s.heading_at[0, 1 : s.count[0]].tolist()
+    headings = s.direction_at[0, 1 : s.path_length[0]].tolist()
     assert (terminated, truncated) == (True, False)
     assert len(rewards) == info["length"] == (grid_arrival if "Grid" in env_id else arrival)(headings)
     assert [r for r in rewards if r] == [0.1] * (len(headings) - 1) + [1.0]
@@ -190,7 +190,7 @@ def test_endless_player_walks_on(limit):
         options = {"max_steps": limit, "reward_fall_off": -5.0}
         rewards, terminated, truncated, info = play_out(env, lambda: player(env.batch)[0], seed, options)
         s = env.batch.state
-        headings = s.heading_at[0, 1 : s.count[0]].tolist()
+        headings = s.direction_at[0, 1 : s.path_length[0]].tolist()
         if WEST in headings[: limit // 4 + 2]:
             continue
         tiles = [step for step in range(1, len(headings) + 1) if arrival(headings[:step]) <= limit]

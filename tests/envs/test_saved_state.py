@@ -163,9 +163,9 @@ def test_a_path_that_grows():
     """Saved when it is longer than a fresh environment has room for, it goes on growing."""
     envs = make_envs("Endless-MysteryPath-v0", LANES)
     envs.reset(seed=0, options={"agent_speed": 6.0, "stamina_level": 1000})
-    room = envs.unwrapped.state.cell.shape[1]
+    room = envs.unwrapped.state.path_cell.shape[1]
     check_resumes(envs, lambda: make_envs("Endless-MysteryPath-v0", LANES), (90,), chance=np.zeros(LANES), steps=90)
-    assert envs.unwrapped.state.cell.shape[1] > 2 * room
+    assert envs.unwrapped.state.path_cell.shape[1] > 2 * room
 
 
 # ---- what is saved ----
@@ -301,7 +301,7 @@ def test_a_generator_of_no_known_kind():
         lambda parts, at: parts.__setitem__(at, None),
         lambda parts, at: parts[at].popitem(),
         lambda parts, at: parts[0]["arrays"].update(pos=np.zeros((2, 3), np.int64)),
-        lambda parts, at: parts[0]["arrays"].update(cell=parts[0]["arrays"]["cell"][:1]),
+        lambda parts, at: parts[0]["arrays"].update(path_cell=parts[0]["arrays"]["path_cell"][:1]),
         lambda parts, at: parts[0]["settings"].pop(),
     ],
     ids=["no parts", "no entries", "None", "one entry less", "shape", "lanes", "settings"],

@@ -262,7 +262,7 @@ def test_wait_is_always_the_first_interval():
         options = {**SAFE, "spot_min_speed": 0.0, "spot_max_speed": 0.0, "max_steps": 1000}
         options |= {"spawn_interval_decay": 0.5} if env_id == FINITE else {"steps_per_coin": -1}
         env.reset(seed=0, options=options)
-        counts = [(env.step([0, 0]), int(env.batch.state.count[0]))[1] for _ in range(400)]
+        counts = [(env.step([0, 0]), int(env.batch.state.num_spots[0]))[1] for _ in range(400)]
         assert counts == [first + (step + 1) // interval for step in range(400)]
 
 
@@ -271,7 +271,7 @@ def test_num_spawns_runs_out():
     slow = {"spot_min_speed": 0.0, "spot_max_speed": 0.0}
     options = {**SAFE, **slow, "num_spawns": 3, "initial_spawns": 0, "initial_spawn_interval": 0}
     env.reset(seed=0, options={**options, "spawn_interval_threshold": 0})
-    counts = [(env.step([0, 0]), int(env.batch.state.count[0]))[1] for _ in range(10)]
+    counts = [(env.step([0, 0]), int(env.batch.state.num_spots[0]))[1] for _ in range(10)]
     assert counts == [1, 2, 3] + [3] * 7
 
 
@@ -281,12 +281,12 @@ def test_spotlights_that_never_leave_do_not_pile_up(env_id):
     fast = {"spawn_interval": 1} if env_id == ENDLESS else {"initial_spawn_interval": 0, "spawn_interval_threshold": 0}
     never = {"max_steps": -1, "steps_per_coin": -1} if env_id == ENDLESS else {"max_steps": -1, "num_spawns": 10**9}
     env.reset(seed=0, options={**SAFE, **fast, **never, "spot_min_speed": 0.0, "spot_max_speed": 0.0})
-    counts = [(env.step([0, 0]), int(env.batch.state.count[0]))[1] for _ in range(MOST_SPOTS + 10)]
+    counts = [(env.step([0, 0]), int(env.batch.state.num_spots[0]))[1] for _ in range(MOST_SPOTS + 10)]
     assert counts[:3] == [counts[0], counts[0] + 1, counts[0] + 2]
     assert counts[-11:] == [MOST_SPOTS] * 11
     assert env.batch.state.spots.shape[2] <= MOST_SPOTS + 2
     env.batch.state.spots[TIME, 0, 5] = 1.0  # one leaves, and the next one comes
-    counts = [(env.step([0, 0]), int(env.batch.state.count[0]))[1] for _ in range(3)]
+    counts = [(env.step([0, 0]), int(env.batch.state.num_spots[0]))[1] for _ in range(3)]
     assert counts == [MOST_SPOTS - 1, MOST_SPOTS, MOST_SPOTS]
 
 
@@ -298,12 +298,12 @@ def test_spotlight_behind_a_removed_one_pauses():
     s.spots[TIME, 0, :4] = [1.0, 0.25, 1.0, 0.5]
     env.step([0, 0])
     # The second skips a step behind the first, and the fourth behind the third.
-    assert s.count[0] == 2
+    assert s.num_spots[0] == 2
     assert s.spots[TIME, 0, :2].tolist() == [0.25, 0.5]
-    assert not env.batch.state.place[:, 0].any()
+    assert not env.batch.state.spot_place[:, 0].any()
     env.step([0, 0])
     assert (s.spots[TIME, 0, :2] > [0.25, 0.5]).all()
-    assert env.batch.state.place[:, 0, :2].all()
+    assert env.batch.state.spot_place[:, 0, :2].all()
 
 
 @pytest.mark.parametrize("low_high", [("spot_min_radius", "spot_max_radius"), ("spot_min_speed", "spot_max_speed")])

@@ -16,7 +16,7 @@ from memory_gym_envs.base import ALL
 from memory_gym_envs.character import FACINGS, PAD
 from memory_gym_envs.entries import vector_slices, vector_space
 from memory_gym_envs.mortar_mayhem import COMMANDS, SYMBOL, SYMBOL_AT
-from memory_gym_envs.mystery_path import BEYOND, ROWS, SIDE
+from memory_gym_envs.mystery_path import PIT_ROWS, ROWS, SIDE
 
 LANES, STEPS = 48, 120
 OPTIONS = {  # played one after the other, each by the ids that have its options
@@ -122,6 +122,7 @@ def look(env_id, options, **state):
     """The frames and vectors of an environment whose lanes are in this state: as check() counts them."""
     envs = gym.make_vec(env_id, num_envs=len(state["facing"]), obs_type="vector")
     envs.reset(seed=0, options=options)
+    assert state.keys() <= envs.state.__dataclass_fields__.keys()
     # All lanes have the same level, but for what is set.
     for name in envs.state.__dataclass_fields__:
         field = getattr(envs.state, name)
@@ -171,9 +172,15 @@ def test_tiles_behind_large_agents(arena, scale):
     x, y, facing, tile = combinations(np.append(places, [42 + PAD, 45 + PAD]), places, [0, 3], tiles)
     envs = gym.make_vec("MortarMayhemB-v0")
     envs.reset(options={"arena_size": arena})
-    floor = envs.state.blue[0] + tile
+    floor = envs.state.calm_floor[0] + tile
     goal = first + 14 * np.stack(np.divmod(np.maximum(tile - 1, 0), arena), axis=1)
-    state = {"pos": np.stack([x, y], axis=1), "facing": facing, "floor": floor, "goal": goal, "lit": tile > 0}
+    state = {
+        "pos": np.stack([x, y], axis=1),
+        "facing": facing,
+        "floor": floor,
+        "target_corner": goal,
+        "burning": tile > 0,
+    }
     envs, (_, frames, vectors, _) = look("MortarMayhemB-v0", {"arena_size": arena, "agent_scale": scale}, **state)
     assert vectors >= frames * SAME
     at, seen = vector_slices(envs.variant.entries), envs.vectors(ALL)
@@ -198,8 +205,8 @@ def test_crosses_over_agents(env_id, scale):
     """A cross hides much of a small agent, and the screen's edge hides crosses."""
     endless = env_id.startswith("Endless")
     rows = np.arange(-PAD, 84 + PAD) if endless else np.arange(25, 50)
-    x, y, facing, hurt = combinations([42], rows, np.arange(FACINGS), [False, True])
-    state = {"pos": np.stack([x, y], axis=1) + PAD, "facing": facing, "hurt": hurt}
+    x, y, facing, shows_cross = combinations([42], rows, np.arange(FACINGS), [False, True])
+    state = {"pos": np.stack([x, y], axis=1) + PAD, "facing": facing, "shows_cross": shows_cross}
     envs, (count, frames, vectors, _) = look(env_id, {"agent_scale": scale}, **state)
     assert vectors == frames
     cross = envs.vectors(ALL)[:, vector_slices(envs.variant.entries)["cross"]][:, 0] > 0
@@ -212,8 +219,8 @@ def test_crosses_over_agents(env_id, scale):
 def test_origins_behind_large_agents(scale):
     columns, rows, x = combinations(np.arange(SIDE), np.arange(SIDE), [36, 42, 45])
     cell = np.ones((len(x), SIDE * SIDE + 1), int)
-    cell[:, 1] = columns * ROWS + BEYOND + rows
-    state = {"pos": np.stack([x, x], axis=1) + PAD, "facing": np.zeros_like(x), "cell": cell}
+    cell[:, 1] = columns * ROWS + PIT_ROWS + rows
+    state = {"pos": np.stack([x, x], axis=1) + PAD, "facing": np.zeros_like(x), "path_cell": cell}
     envs, (count, frames, vectors, _) = look("MysteryPath-v0", {"agent_scale": scale, "show_origin": True}, **state)
     origin = envs.vectors(ALL)[:, vector_slices(envs.variant.entries)["origin"]]
     shown = origin.any(axis=1)
@@ -291,7 +298,7 @@ def test_fire(env_id, feedback):
     envs, s, entries = made(env_id, seed=5, visual_feedback=feedback)
     burnt, size = 0, 6 if env_id.startswith("Endless") else 5
     for _ in range(110):
-        fire = bool(s.lit[0]) and feedback
+        fire = bool(s.burning[0]) and feedback
         assert (entries("fire")[0], entries("arena")[0]) == (fire, np.float32(size / 6))
         tile = 42 - 7 * size + 14 * envs.ground_truth()[0] * (size - 1) + 7
         assert np.allclose(entries("safe") * 84, tile * fire, atol=1e-4)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.random import MT19937, PCG64, PCG64DXSM, SFC64, Generator, Philox
 
-from memory_gym_envs.words import LOW, PERCENT_AGAIN, Tape, below, words
+from memory_gym_envs.words import LOW, PERCENT_AGAIN, WordBuffer, below, words
 
 LIMITS = [
     1,
@@ -48,9 +48,9 @@ def test_words_make_the_generators_numbers(kind):
 def test_a_tape_draws_the_used_words_only(kind, used):
     for seed in range(4):
         rng, twin = twins(kind, seed)
-        tape = Tape(rng, 9)
-        assert [tape() for _ in range(used)] == [twin.integers(0, 1 << 32) for _ in range(used)]
-        tape.close()
+        buffer = WordBuffer(rng, 9)
+        assert [buffer() for _ in range(used)] == [twin.integers(0, 1 << 32) for _ in range(used)]
+        buffer.close()
         assert same_state(rng, twin)
         assert rng.integers(0, 100) == twin.integers(0, 100)
 
@@ -59,27 +59,27 @@ def test_a_tape_draws_the_used_words_only(kind, used):
 def test_a_tape_makes_the_generators_numbers(kind):
     for seed in range(4):
         rng, twin = twins(kind, seed)
-        tape = Tape(rng, 2000)
+        buffer = WordBuffer(rng, 2000)
         for limit in LIMITS * 20:
-            assert tape.eighths[tape.used] == tape.words[tape.used] * 8 >> 32
-            assert below(tape, limit) == twin.integers(0, limit)
+            assert buffer.eighths[buffer.used] == buffer.words[buffer.used] * 8 >> 32
+            assert below(buffer, limit) == twin.integers(0, limit)
         things = list(range(24))
-        assert tape.hits(things, 33) == [thing for thing in things if twin.integers(0, 100) < 33]
+        assert buffer.sample_each(things, 33) == [thing for thing in things if twin.integers(0, 100) < 33]
         for count in (0, 1, 4, 23, 24, 25):
             left, expected = things.copy(), things.copy()
-            picked = [expected.pop(twin.integers(0, len(expected))) for _ in range(min(count, len(things)))]
-            assert tape.picks(left, count) == picked
-        assert tape.picks([], 4) == []
-        tape.close()
+            taken = [expected.pop(twin.integers(0, len(expected))) for _ in range(min(count, len(things)))]
+            assert buffer.take_random(left, count) == taken
+        assert buffer.take_random([], 4) == []
+        buffer.close()
         assert same_state(rng, twin)
 
 
 def loaded(numbers):
-    """A tape of these words, and of some more that are never drawn again."""
-    tape = Tape(np.random.default_rng(0), 2)
-    tape.used = 0
-    tape.load(np.array(numbers + 9 * [12345], np.uint32).tobytes())
-    return tape
+    """A buffer of these words, and of some more that are never drawn again."""
+    buffer = WordBuffer(np.random.default_rng(0), 2)
+    buffer.used = 0
+    buffer.load(np.array(numbers + 9 * [12345], np.uint32).tobytes())
+    return buffer
 
 
 @pytest.mark.parametrize("percent", [1, 33, 50, 99])
@@ -88,19 +88,21 @@ def test_hits_at_the_edges_of_every_number(percent):
     edges = [-(-part * (1 << 32) // 100) for part in range(100)]
     for edge in edges:
         for word in ((edge - 1) & LOW, edge, edge + 1):
-            tape, one_by_one = loaded([5, word, 7]), loaded([5, word, 7])
-            assert tape.hits([10, 11, 12], percent) == [10 + i for i in range(3) if below(one_by_one, 100) < percent]
-            assert tape.used == one_by_one.used == 3 + (word in PERCENT_AGAIN)
+            buffer, one_by_one = loaded([5, word, 7]), loaded([5, word, 7])
+            assert buffer.sample_each([10, 11, 12], percent) == [
+                10 + i for i in range(3) if below(one_by_one, 100) < percent
+            ]
+            assert buffer.used == one_by_one.used == 3 + (word in PERCENT_AGAIN)
     assert len(PERCENT_AGAIN) == (1 << 32) % 100
 
 
 def test_picks_draw_again():
     """Below six, words are drawn again of which six times as much leaves less than 2**32 % 6 = 4."""
-    tape = loaded([0, 1 << 31, (1 << 31) + 1])
-    assert tape.picks([0, 1, 2, 3, 4, 5], 1) == [3]
-    assert tape.used == 3
+    buffer = loaded([0, 1 << 31, (1 << 31) + 1])
+    assert buffer.take_random([0, 1, 2, 3, 4, 5], 1) == [3]
+    assert buffer.used == 3
 
 
 def test_a_tape_needs_64_bit_numbers():
     with pytest.raises(ValueError, match="MT19937"):
-        Tape(Generator(MT19937(0)), 4)
+        WordBuffer(Generator(MT19937(0)), 4)

@@ -403,7 +403,7 @@ def test_spotlights_are_not_the_environments_own():
 def test_spotlights_begin_anew_with_every_episode():
     envs = white_veil("MysteryPath-v0")
     envs.reset(seed=1, options={"max_steps": 60})
-    counts = [envs._light.state.count.tolist() for _ in roll(envs, 130)]
+    counts = [envs._light.state.num_spots.tolist() for _ in roll(envs, 130)]
     # Four, and a fifth after 40 steps, in each of the episodes of 60 steps.
     assert counts[38] == counts[98] == counts[59] == counts[119] == [4] * LANES
     assert counts[39] == counts[58] == counts[99] == counts[118] == [5] * LANES

@@ -13,18 +13,19 @@ from memory_gym_envs.character import FACINGS, PAD, SPAN, radius_of
 from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.entries import Entries
 
-LARGEST = radius_of(1.0)
+LARGEST_RADIUS = radius_of(1.0)
 UNSEEN = SPAN  # the position of an agent of which nothing shows, and its size
 # What entries say, by their code: stored positions, then UNSEEN, then sizes.
-VALUES = np.concatenate([(np.arange(SPAN) - PAD) / SCREEN, np.arange(1 + LARGEST) / LARGEST]).astype(np.float32)
+SIZES = np.arange(1 + LARGEST_RADIUS) / LARGEST_RADIUS
+VALUES = np.concatenate([(np.arange(SPAN) - PAD) / SCREEN, SIZES]).astype(np.float32)
 FLAGS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little").astype(np.float32)
 NOTHING = (UNSEEN, UNSEEN, UNSEEN, 0)  # the codes
 PLACE_STRIDES = np.array([1, SPAN])
 
 
 def agent_entries(low: int, high: int) -> tuple[Entries, ...]:
-    """The entries that `look` writes, for agents whose centre stays between these pixels on both axes."""
-    size = f"radius of the agent's body, / {LARGEST} pixels; 0: nothing of the agent shows"
+    """What `write_agent_entries` writes, for agents whose centre stays between these pixels on both axes."""
+    size = f"radius of the agent's body, / {LARGEST_RADIUS} pixels; 0: nothing of the agent shows"
     place = "the agent's centre, x and y, / 84 pixels; the middle of all that would look the same"
     facing = "one-hot: up, up-left, left, ..., up-right; 1 for each that would look the same"
     ends = min(low / SCREEN, 0.0), high / SCREEN
@@ -42,43 +43,43 @@ class View(NamedTuple):
     rows: range  # and along y
 
 
-class Looks(NamedTuple):
+class AppearanceTables(NamedTuple):
     """The tables of all views in use, stacked: row view * FACINGS + facing is a sprite's."""
 
-    seen: np.ndarray  # (R * P * P, 4) uint8: codes of size, x and y, and the facings as bits
+    codes: np.ndarray  # (R * P * P, 4) uint8: codes of size, x and y, and the facings as bits
     solid: np.ndarray  # (R, W + 2, W + 2) bool: the sprites with a transparent rim
 
 
-def make_looks(views: list[View]) -> Looks:
+def make_appearance_tables(views: list[View]) -> AppearanceTables:
     """Prepares the views."""
     width = max(view.solid.shape[1] for view in views) + 2
     solids = []
     for view in views:
         margin = (width - view.solid.shape[1]) // 2
         solids.append(np.pad(view.solid, ((0, 0), (margin, margin), (margin, margin))))
-    return Looks(np.concatenate([see(view) for view in views]), np.concatenate(solids))
+    return AppearanceTables(np.concatenate([appearance_codes(view) for view in views]), np.concatenate(solids))
 
 
-def see(view: View) -> np.ndarray:
-    """(FACINGS * P * P, 4) uint8: Looks.seen of one view. What looks the same has the same codes."""
-    prints = fingerprints(view)
-    _, kind = np.unique(prints, return_inverse=True)
+def appearance_codes(view: View) -> np.ndarray:
+    """(FACINGS * P * P, 4) uint8: AppearanceTables.codes of one view. What looks the same has the same codes."""
+    hashes = appearance_hashes(view)
+    _, kind = np.unique(hashes, return_inverse=True)
     kind = kind.reshape(-1)
-    facing, y, x = (index.reshape(-1) for index in np.indices(prints.shape))
+    facing, y, x = (index.reshape(-1) for index in np.indices(hashes.shape))
     same_look, count = np.zeros((kind.max() + 1, FACINGS), bool), np.bincount(kind)
     same_look[kind, facing] = True
     column, row = (np.rint(np.bincount(kind, place) / count) for place in (x, y))
     size = np.full_like(count, UNSEEN + radius_of(view.scale))
     facings = np.packbits(same_look, axis=1, bitorder="little")
     codes = np.column_stack([size, column + view.columns.start, row + view.rows.start, facings]).astype(np.uint8)
-    codes[kind[prints.reshape(-1) == 0]] = NOTHING
+    codes[kind[hashes.reshape(-1) == 0]] = NOTHING
     table = np.full((FACINGS, SPAN, SPAN, len(NOTHING)), NOTHING, np.uint8)
     reach = (slice(None), slice(view.rows.start, view.rows.stop), slice(view.columns.start, view.columns.stop))
-    table[reach] = codes[kind].reshape(*prints.shape, len(NOTHING))
+    table[reach] = codes[kind].reshape(*hashes.shape, len(NOTHING))
     return table.reshape(-1, len(NOTHING))
 
 
-def fingerprints(view: View) -> np.ndarray:
+def appearance_hashes(view: View) -> np.ndarray:
     """(FACINGS, rows, columns) uint64: numbers that differ where the agents look different; 0 where nothing shows.
 
     The sum over all pixels that show of their colour times their place on the screen, a random number. So two pictures
@@ -93,22 +94,22 @@ def fingerprints(view: View) -> np.ndarray:
     place = np.pad(place, (before, width + SPAN - before - SCREEN))
     sums = np.pad(np.cumsum(place, axis=1), ((0, 0), (1, 0)))
     rows, columns = view.rows, view.columns
-    prints = np.zeros((FACINGS, len(rows), len(columns)), np.uint64)
+    hashes = np.zeros((FACINGS, len(rows), len(columns)), np.uint64)
     for facing, row, column in np.argwhere(edges):
         reach = sums[rows.start + row : rows.stop + row, columns.start + column : columns.stop + column]
-        prints[facing] += edges[facing, row, column] * reach
-    return prints
+        hashes[facing] += edges[facing, row, column] * reach
+    return hashes
 
 
-def look(out: np.ndarray, looks: Looks, sprite: np.ndarray, pos: np.ndarray) -> None:
+def write_agent_entries(out: np.ndarray, tables: AppearanceTables, sprite: np.ndarray, pos: np.ndarray) -> None:
     """Writes the entries of the agents with these sprites (n,) at these positions (n, 2) to out, (n, 11)."""
-    seen = looks.seen.take(sprite * (SPAN * SPAN) + pos.dot(PLACE_STRIDES), axis=0)  # (n, 4)
-    out[:, :3] = VALUES.take(seen[:, :3])
-    out[:, 3:] = FLAGS.take(seen[:, 3], axis=0)
+    codes = tables.codes.take(sprite * (SPAN * SPAN) + pos.dot(PLACE_STRIDES), axis=0)  # (n, 4)
+    out[:, :3] = VALUES.take(codes[:, :3])
+    out[:, 3:] = FLAGS.take(codes[:, 3], axis=0)
 
 
-def covered(looks: Looks, sprite: np.ndarray, pos: np.ndarray, points: np.ndarray) -> np.ndarray:
+def covered(tables: AppearanceTables, sprite: np.ndarray, pos: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Which pixels lie under the agents: (n, k) bool for points (n, k, 2), x and y with PAD."""
-    width = looks.solid.shape[1]
+    width = tables.solid.shape[1]
     place = (points - pos[:, None] + width // 2).clip(0, width - 1)
-    return looks.solid[sprite[:, None], place[..., 1], place[..., 0]]
+    return tables.solid[sprite[:, None], place[..., 1], place[..., 0]]
