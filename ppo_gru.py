@@ -441,7 +441,7 @@ def layer_init(layer: nn.Module, gain: float = math.sqrt(2)) -> nn.Module:
 
 
 class AtariCNN(nn.Sequential):
-    """The convolutions of Mnih et al. (2015), table 6.2. `speed_up` in section 9 runs them in chunks on a CPU."""
+    """The convolutions of Mnih et al. (2015), table 6.2."""
 
     def __init__(self, channels: int):
         super().__init__(
@@ -496,7 +496,7 @@ class Encoder(nn.Module):
 
     def forward(self, obs: dict[str, Tensor]) -> Tensor:
         """Encode observations, each part (B, ...), to (B, self.width)."""
-        features = [cnn(obs[name]) for cnn, name in zip(self.cnns, self.images, strict=True)]
+        features = [in_chunks(cnn, obs[name]) for cnn, name in zip(self.cnns, self.images, strict=True)]  # section 9
         if self.vectors:
             vector = torch.cat([obs[name] for name in self.vectors], -1)
             features.append(F.relu(self.mlp(fourier_features(vector, self.frequencies))))
@@ -856,7 +856,7 @@ def ppo_loss(
     logs = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, "log_barrier": barrier}
     if agent.decoder is not None:  # (5.5)
         with autocast(args, index.device):
-            logits = agent.decoder(features.detach() if args.reconstruction_detach else features)
+            logits = in_chunks(agent.decoder, features.detach() if args.reconstruction_detach else features)
         logs["reconstruction_loss"] = reconstruction_loss(logits.float(), gather(rollout.obs[agent.encoder.images[0]]))
         loss = loss + args.reconstruction_coef * logs["reconstruction_loss"]
     if agent.estimator is not None:  # (5.6)
@@ -1170,7 +1170,6 @@ def setup(args: Args) -> Run:
     run = make_run(args, 0 if checkpoint is None else checkpoint["step"])
     if args.load_model is not None and checkpoint is None:
         load_weights(run.agent, read_model(args.load_model), args.load_model)
-    speed_up(run.agent, args)
     rank, _ = rank_and_size()
     if rank == 0:
         make_folder(args, run)
@@ -1689,7 +1688,11 @@ class UniqueObservations:
         inverse = None
         if self.first_occurrence is not None:
             index, inverse = self.first_occurrence[index].unique(return_inverse=True)
-        x = encoder({name: part.index_select(0, index.to(part.device)) for name, part in self.obs.items()})
+        count = len(index)
+        if torch.is_autocast_enabled("cpu"):
+            # Kernels for bfloat16 are compiled for every batch size, which can take longer than running them.
+            index = F.pad(index, (0, -count % 16))
+        x = encoder({name: part.index_select(0, index.to(part.device)) for name, part in self.obs.items()})[:count]
         return x if inverse is None else x.index_select(0, inverse)
 
 
@@ -1704,42 +1707,14 @@ def first_occurrences(obs: dict[str, Tensor]) -> Tensor:
     return torch.tensor([first.setdefault(each, index) for index, each in enumerate(hashes)])
 
 
-def speed_up(agent: Agent, args: Args) -> None:
-    """Replace the forward functions of the agent's layers by faster ones, where it is on a CPU."""
-    if next(agent.parameters()).device.type != "cpu":
-        return
-    for images in (*agent.encoder.cnns, *filter(None, [agent.decoder])):
-        images.forward = in_chunks(images.forward)
-    if args.amp:
-        agent.encoder.forward = pad_batch(agent.encoder.forward)
+CHUNK = 256  # the backward pass of 2,048 images at once takes about 1.5 times as long on a CPU, for its caches
 
 
-CHUNK = 256  # images; the backward pass of 2,048 at once takes about 1.5 times as long on a CPU, for its caches
-
-
-def in_chunks(forward: Callable) -> Callable:
-    """Return a function that maps (B, ...) chunk by chunk."""
-
-    def chunked(x: Tensor) -> Tensor:
-        parts = [forward(part) for part in x.split(CHUNK)]
-        return torch.cat(parts) if len(parts) > 1 else parts[0]
-
-    return chunked
-
-
-def pad_batch(forward: Callable, multiple: int = 16) -> Callable:
-    """Return a function of a dict of batches that pads them to a multiple, and drops the padding again.
-
-    In bfloat16, a CPU's kernels are compiled for every batch size, which can take longer than running them.
-    """
-
-    def pad(x: Tensor) -> Tensor:
-        return F.pad(x, [0, 0] * (x.dim() - 1) + [0, -len(x) % multiple])
-
-    def padded(x: dict[str, Tensor]) -> Tensor:
-        return forward({name: pad(part) for name, part in x.items()})[: len(next(iter(x.values())))]
-
-    return padded
+def in_chunks(network: Callable, x: Tensor) -> Tensor:
+    """Apply a network that reads or makes images to x (B, ...): on a CPU chunk by chunk."""
+    if x.device.type != "cpu" or len(x) <= CHUNK:
+        return network(x)
+    return torch.cat([network(part) for part in x.split(CHUNK)])
 
 
 def packed_gru(rnn: nn.GRU, x: Tensor, pieces: Pieces, hidden: Tensor) -> Tensor:

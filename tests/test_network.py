@@ -7,7 +7,7 @@ import torch
 
 import ppo_gru
 import ppo_trxl
-from ppo_gru import Agent, Args, AtariCNN, in_chunks, speed_up
+from ppo_gru import Agent, Args, AtariCNN, UniqueObservations, in_chunks
 
 PICTURE = gym.spaces.Box(0, 255, (84, 84, 3), np.uint8)
 PIXELS = gym.spaces.Dict(observation=PICTURE)
@@ -83,28 +83,26 @@ def test_chunks_do_not_change_the_features(monkeypatch):
     torch.manual_seed(0)
     cnn, pixels = AtariCNN(3), torch.randint(0, 256, (10, 84, 84, 3), dtype=torch.uint8)
     whole, sizes = cnn(pixels), []
+    cnn.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
     monkeypatch.setattr(ppo_gru, "CHUNK", 3)
-    torch.testing.assert_close(in_chunks(lambda x: (sizes.append(len(x)), cnn(x))[1])(pixels), whole)
+    torch.testing.assert_close(in_chunks(cnn, pixels), whole)
     assert sizes == [3, 3, 3, 1]
 
 
-def test_rows_are_rounded_up_in_bfloat16_and_change_nothing():
+def test_batches_are_rounded_up_in_bfloat16_which_changes_nothing():
     torch.manual_seed(0)
-    args = Args(hidden_size=32, head_size=32, amp=True)
-    agent = Agent(PIXELS, [4], args)
-    pixels = torch.zeros(16, 84, 84, 3, dtype=torch.uint8)
-    pixels[:5] = torch.randint(0, 256, (5, 84, 84, 3))
-    taken, found = [], []
-    agent.encoder.cnns[0].register_forward_pre_hook(lambda _, inputs: taken.append(len(inputs[0])))
-    speed_up(agent, args)
-    for rows in (5, 16):
+    agent = Agent(PIXELS, [4], Args(hidden_size=32, head_size=32))
+    pixels = torch.randint(0, 256, (16, 1, 84, 84, 3), dtype=torch.uint8)
+    observations, sizes, found = UniqueObservations({"observation": pixels}, agent), [], []
+    agent.encoder.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0]["observation"])))
+    for count in (5, 16):
         agent.zero_grad()
         with torch.autocast("cpu", torch.bfloat16):
-            x = agent.encoder({"observation": pixels[:rows]})
-        assert len(x) == rows
+            x = observations.encode(agent.encoder, torch.arange(count))
+        assert len(x) == count
         x[:5].square().sum().backward()
         found.append([x[:5], *(parameter.grad for parameter in agent.encoder.parameters())])
-    assert taken == [16, 16]
+    assert sizes == [16, 16]
     for got, want in zip(*found, strict=True):
         torch.testing.assert_close(got, want, rtol=0, atol=0)
 
