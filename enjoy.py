@@ -4,7 +4,7 @@
 
 The page is one file that needs no network: what the agent saw beside the ground truth (and beside what it painted from
 memory, where it was trained to), the probabilities of its actions, its state values and its policy's entropy, the
-rewards, and what every block of a Transformer-XL looked at (thesis 6.5). Needs plotly and pillow, the extra `eval`.
+rewards, and what every block of a Transformer-XL looked at (thesis 6.5). Needs the extra `eval`.
 
 Shape letters: T steps of the episode, A action branches, K blocks, H heads, M items that the last step could look at.
 """
@@ -26,14 +26,15 @@ from torch import Tensor, nn
 
 import ppo_gru
 import ppo_trxl
-from evaluate import script_of
 from memory_gym_envs.making import check_draws, final_numbers, is_memory_gym
 
 try:
     from PIL import Image
     from plotly.offline import get_plotlyjs
-except ImportError:  # main tells how to get them
-    Image = get_plotlyjs = None
+except ImportError as error:
+    raise SystemExit(f'enjoy.py needs {error.name}: pip install -e ".[eval]"') from None
+
+from evaluate import script_of
 
 SHEET = 16  # frames in one picture: a neighbour costs few bytes, and a jump makes a browser decode one sheet only
 VIEW, RECONSTRUCTION = "agent's view", "reconstruction"
@@ -132,9 +133,9 @@ def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, max_steps: int
 def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode) -> tuple[Tensor, Any]:
     """Return actions (1, A) and memory, as `Agent.get_action_and_value` does; add what was computed to the episode."""
     x = agent.encoder(obs)
+    y, after = agent.memory.step(x, memory)  # raises MemoryLimit; what it stores, this step's attention does not see
     if isinstance(agent.memory, ppo_trxl.Memory):
         episode.attention.append(attention_of(agent.memory, x, memory)[0].numpy())
-    y, memory = agent.memory.step(x, memory)
     logits, values, features = agent.heads(y)
     policy = agent.heads.distributions(logits)
     actions = torch.stack([branch.sample() for branch in policy], -1)
@@ -146,7 +147,7 @@ def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode)
         episode.film(RECONSTRUCTION, displayable(agent.decoder(features).sigmoid()[0].numpy()))
     if agent.estimator is not None:
         episode.estimate.append(agent.estimator(features)[0].numpy())
-    return actions, memory
+    return actions, after
 
 
 def attention_of(memory: ppo_trxl.Memory, x: Tensor, state: ppo_trxl.MemoryState) -> Tensor:
@@ -290,8 +291,6 @@ def load(path: str) -> tuple[nn.Module, gym.vector.VectorEnv, Any]:
 
 def main(config: Config) -> str:
     """Play, write the page, and return one line that says how it went. Raises what `load` and `play` raise."""
-    if get_plotlyjs is None:
-        raise ImportError('enjoy.py needs plotly and pillow: pip install -e ".[eval]"')
     if not 1 <= config.max_steps <= 100_000:
         raise ValueError(f"--max-steps is {config.max_steps}; it must be from 1 to 100000")
     if config.seed is not None and not 0 <= config.seed < 2**63:

@@ -55,6 +55,7 @@ try:
 except ImportError as error:
     raise SystemExit(f'evaluate.py needs {error.name}: pip install -e ".[eval]"') from None
 
+MOST_EPISODES = 100_000  # played at once
 SCRIPTS = {"ppo_gru": ppo_gru, "ppo_trxl": ppo_trxl}
 # A family's own metric (6.1.3), by the beginning of the id; any other environment's is the return.
 OWN_METRIC = {
@@ -114,7 +115,8 @@ class Config:
     out: str = "curves"
     """draw to OUT.png and OUT.svg"""
     metrics: tuple[str, ...] = ()
-    """what to show, e.g. return success (by default the family's own metric, when playing also return and length)"""
+    """what to show, e.g. return success (by default the family's own metric; of episodes that are played also return,
+    length and falls)"""
 
 
 # ---- STATISTICS ----
@@ -232,10 +234,17 @@ def labels(agents: list[dict[str, Any]]) -> list[str]:
     if len(set(names)) == len(names):
         return names
     keys = dict.fromkeys(key for args in agents for key in args if key not in BOOKKEEPING)
-    differ = [key for key in keys if len({args[key] for args in agents if key in args}) > 1]
+    differ = [key for key in keys if differs(key, agents)]
     bare = {"exp_name", "script"}
     words = [[args[k] if k in bare else f"{k}={args[k]}" for k in differ if k in args] for args in agents]
     return [" ".join(dict.fromkeys(each)) for each in words]
+
+
+def differs(key: str, agents: list[dict[str, Any]]) -> bool:
+    """Return whether an argument tells agents apart: by its values, or since some agents of a script lack it."""
+    values = {args[key] for args in agents if key in args}
+    having = [{key in args for args in agents if args["script"] == script} for script in {a["script"] for a in agents}]
+    return len(values) > 1 or any(len(each) > 1 for each in having)
 
 
 # ---- CURVES ----
@@ -285,7 +294,7 @@ def read_run(path: str) -> RunLog:
         except (KeyError, TypeError, AttributeError, ValueError, EOFError, zlib.error, gzip.BadGzipFile):
             raise NoCurvesError(f"{path} holds no curves of a training run") from None
     if not os.path.isdir(path):
-        raise ValueError(f"there is no run folder {path}")
+        raise NoCurvesError(f"there is no run folder {path}")
     logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it warns of a crash where a run was resumed
     events = EventAccumulator(path, size_guidance={"scalars": 0, "tensors": 0})
     events.Reload()
@@ -365,9 +374,13 @@ def write_run(run: RunLog, path: str) -> None:
         name: (np.diff(steps, prepend=0).tolist(), (values if "eval/" in name else four_digits(values)).tolist())
         for name, (steps, values) in kept.items()
     }
-    with gzip.open(f"{path}.part", "wt") as file:
-        json.dump({"machine": run.machine, "args": run.args, "curves": curves}, file, separators=(",", ":"))
-    os.replace(f"{path}.part", path)  # a file that is there is complete
+    part = Path(f"{path}.part")
+    try:
+        with gzip.open(part, "wt") as file:
+            json.dump({"machine": run.machine, "args": run.args, "curves": curves}, file, separators=(",", ":"))
+        os.replace(part, path)  # a file that is there is complete
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def curve_name(metric: str, runs: list[RunLog]) -> str:
@@ -671,6 +684,15 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
     return report
 
 
+def check_numbers(config: Config) -> None:
+    """Raise ValueError for the first number that cannot work."""
+    for name, low in (("levels", 1), ("repeats", 1), ("max_steps", 1), ("seed", 0)):
+        if not low <= getattr(config, name) < 2**63:
+            raise ValueError(f"{ppo_gru.flag(name)} is {getattr(config, name)}; it must be from {low} to 2 ** 63 - 1")
+    if config.levels * config.repeats > MOST_EPISODES:
+        raise ValueError(f"--levels x --repeats is {config.levels * config.repeats}; at most {MOST_EPISODES} fit")
+
+
 def main(config: Config) -> None:
     """Do what the command line asks for.
 
@@ -678,9 +700,7 @@ def main(config: Config) -> None:
     """
     if bool(config.checkpoints) == bool(config.curves):
         raise ValueError("give either checkpoints to play with (runs/*/model.pt), or --curves and run folders (runs/*)")
-    for name, low in (("levels", 1), ("repeats", 1), ("max_steps", 1), ("seed", 0)):
-        if not low <= getattr(config, name) < 2**63:
-            raise ValueError(f"{ppo_gru.flag(name)} is {getattr(config, name)}; it must be from {low} to 2 ** 63 - 1")
+    check_numbers(config)
     for path in (config.json, config.out):
         if path is not None and not os.path.isdir(os.path.dirname(path) or "."):
             raise ValueError(f"there is no folder {os.path.dirname(path)} to write to")

@@ -106,7 +106,7 @@ class Args:
     cuda: bool = True
     """train on the GPU when there is one"""
     amp: bool = False
-    """compute the networks in bfloat16, faster on processors that have it; losses stay in float32"""
+    """compute encoder, transformer and decoder in bfloat16, faster on processors that have it; the rest is float32"""
     track: bool = False
     """log to Weights and Biases too (needs the extra `track`)"""
     wandb_project_name: str = "memory-gym-baselines"

@@ -59,14 +59,24 @@ TO_1E_4, TO_1E_5 = "TrXL --anneal-steps 200000", "TrXL --anneal-steps 200000 --f
 NOT_NORMALIZED, NORMALIZED = "GRU --target-kl None", "GRU --target-kl None --norm-adv minibatch"
 
 
+def curve(task: Task, run: evaluate.RunLog) -> np.ndarray:
+    """Return a run's evaluations (P, M, E) in the family's metric, of a finite Mortar Mayhem what it carried out.
+
+    That is a share of the commands by the return, since the metric counts a last command that failed as completed.
+    """
+    if task.best_return is not None:
+        return run.curves["eval/return"][1] / task.best_return
+    return run.curves[f"eval/{task.metric}"][1]
+
+
 def score(task: Task, run: evaluate.RunLog) -> float:
-    """Return the mean of a run's last evaluation in the family's metric."""
-    return run.curves[f"eval/{task.metric}"][1][-1].mean()
+    """Return the mean of a run's last evaluation."""
+    return curve(task, run)[-1].mean()
 
 
 def area(task: Task, run: evaluate.RunLog) -> float:
-    """Return the mean of a run's learning curve in the family's metric: it is higher where fewer samples are needed."""
-    return run.curves[f"eval/{task.metric}"][1].mean()
+    """Return the mean of a run's learning curve: it is higher where fewer samples are needed."""
+    return curve(task, run).mean()
 
 
 def falls(task: Task, run: evaluate.RunLog) -> float:

@@ -88,6 +88,14 @@ class Task:
         """Return the name of the family's own metric (6.1.3)."""
         return evaluate.own_metric(self.env_id)
 
+    @property
+    def best_return(self) -> float | None:
+        """Return what all commands of a finite Mortar Mayhem pay, None for other tasks.
+
+        Its metric counts a last command as completed even if it failed, as the original's does. The return does not.
+        """
+        return 0.1 * self.options.get("command_count", [10])[0] if self.env_id.startswith("MortarMayhem") else None
+
 
 SMALL = {
     "mortar-mayhem": Task(
@@ -171,7 +179,7 @@ class Training:
     jobs: int = os.cpu_count() or 1
     """runs at the same time; they share the cores, or have OMP_NUM_THREADS threads each if that is set"""
     evaluations: int = 20
-    """points of a curve"""
+    """evaluations of a training, and one more at its end where they do not divide it evenly"""
     folder: Path = Path("learning")
     """where the runs go"""
     results: Path = Path("learning/results")
@@ -233,7 +241,7 @@ def check(config: Training) -> None:
 def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
     """Plan a training run; an agent is a name in `AGENTS`, which further flags may follow.
 
-    Raises SystemExit for flags that the script does not have, or that belong to the suite.
+    Raises SystemExit for flags that the script refuses, or that belong to the suite.
     """
     steps = int(task.total_timesteps * config.steps_scale)
     of_the_suite = {
@@ -250,8 +258,10 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
     for each, value in of_the_suite.items():
         flags += [f"--{each.replace('_', '-')}", str(value)]
     flags += f"{dashes}{further}".split()
+    module = importlib.import_module(Path(script).stem)
     try:
-        args = importlib.import_module(Path(script).stem).parse_args(flags)
+        args = module.parse_args(flags)
+        module.check_args(args)
     except (ValueError, OSError) as error:
         raise SystemExit(f"{agent}: {error}") from None
     theirs = {each: getattr(args, each) for each in of_the_suite}
@@ -398,10 +408,11 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
         raise SystemExit("; ".join(failed))
 
 
-def row(agent: str, runs: list[evaluate.RunLog], metric: str, best: float) -> str:
+def row(agent: str, runs: list[evaluate.RunLog], metric: str, best: float, best_return: float | None = None) -> str:
     """Return the agent's row: its last score, the largest drop, and what nine tenths of the best agent's score took.
 
-    A drop is how far a seed's mean is below an earlier one.
+    A drop is how far a seed's mean is below an earlier one. With best_return, the mean share of it stands beside the
+    mean score.
     """
     steps, scores = evaluate.align([run.curves[f"eval/{metric}"] for run in runs])  # (P,), (P, R, M, E)
     minutes = 60 * np.mean([run.hours(steps) for run in runs], 0)  # (P,), without evaluations
@@ -415,30 +426,34 @@ def row(agent: str, runs: list[evaluate.RunLog], metric: str, best: float) -> st
         taken = ("the best is 0", "")
     span = "one seed" if ends is None else "{:.2f} to {:.2f}".format(*ends)
     each_seed = ", ".join(f"{mean:.2f}" for mean in means[-1])
-    reached = f"{each_seed} | {scores[-1].mean():.2f} | {middle[-1]:.2f} | {span} | {drop:.2f}"
+    mean = f"{scores[-1].mean():.2f}"
+    if best_return is not None:
+        mean += f" | {last_scores('return', runs).mean() / best_return:.2f}"
+    reached = f"{each_seed} | {mean} | {middle[-1]:.2f} | {span} | {drop:.2f}"
     return f"| {agent} | {reached} | {' | '.join(taken)} | {minutes[-1]:.1f} |"
 
 
-def last_scores(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
+def last_scores(metric: str, runs: list[evaluate.RunLog]) -> np.ndarray:
     """Return the scores (R, M, E) of an agent's seeds at the end of training."""
-    return evaluate.align([run.curves[f"eval/{task.metric}"] for run in runs])[1][-1]
+    return evaluate.align([run.curves[f"eval/{metric}"] for run in runs])[1][-1]
 
 
 def table(task: Task, agents: evaluate.Runs) -> str:
     """Return a task's table, a row for each agent that has runs, and below it what these took and on which machines."""
     runs_of = {agent: runs for agent, runs in agents.items() if runs}
-    best = max(float(evaluate.iqm(last_scores(task, runs))) for runs in runs_of.values())
+    best = max(float(evaluate.iqm(last_scores(task.metric, runs))) for runs in runs_of.values())
     every_run = [run for runs in runs_of.values() for run in runs]
     hours = sum(run.seconds("iteration").sum() for run in every_run) / 3600
     machines = "; ".join(dict.fromkeys(run.machine for run in every_run))
-    header = (
-        "agent | each seed | mean | IQM | 95 % interval | largest drop | steps to 0.9 of the best | minutes to there"
-    )
+    carried_out = () if task.best_return is None else ("carried out",)
+    taken = ("largest drop", "steps to 0.9 of the best", "minutes to there", "minutes")
+    header = ("agent", "each seed", "mean", *carried_out, "IQM", "95 % interval", *taken)
+    left = ("agent", "each seed", "95 % interval")
     lines = [
         f"{task.metric} after {int(every_run[0].args['total_timesteps']):,} steps\n",
-        f"| {header} | minutes |",
-        "|---|---|---:|---:|---|---:|---:|---:|---:|",
-        *(row(agent, runs, task.metric, best) for agent, runs in runs_of.items()),
+        f"| {' | '.join(header)} |",
+        f"|{'|'.join('---' if name in left else '---:' for name in header)}|",
+        *(row(agent, runs, task.metric, best, task.best_return) for agent, runs in runs_of.items()),
         f"\nRuns: {len(every_run)}, together {hours:.1f} hours without evaluations. Machines: {machines}",
     ]
     return "\n".join(lines)
@@ -455,7 +470,7 @@ def overview(tasks: dict[str, evaluate.Runs]) -> str:
     def cell(task: Task, runs: list[evaluate.RunLog]) -> str:
         if not runs:
             return ""
-        scores = last_scores(task, runs)
+        scores = last_scores(task.metric, runs)
         few = f", {len(runs)} seed{'s' * (len(runs) > 1)}" if len(runs) < most else ""
         return f"{evaluate.iqm(scores):.2f} ({scores.mean():.2f}){few}"
 

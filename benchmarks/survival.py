@@ -21,6 +21,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -37,8 +38,8 @@ FLAGS = "--preset laptop --env-id MysteryPath-Grid-v0 --num-envs 4 --num-steps 3
 class Config:
     """What to try."""
 
-    script: str = "ppo_gru"
-    """the script, without .py"""
+    script: Literal["ppo_gru", "ppo_trxl"] = "ppo_gru"
+    """which of the two"""
     kills: int = 100
     """how often to kill"""
     seconds: float = 4.0
@@ -113,7 +114,7 @@ def kill(config: Config) -> None:
             found = scalars(next(Path("runs").glob(f"*__{name}__*")))
             wanted = wanted or found
             if found != wanted:
-                raise RuntimeError(f"{folder} has other scalars than the run that was never stopped")
+                raise RuntimeError(f"{name} has other scalars than the run that was never stopped")
             count["runs"] += 1
     print(
         f"{config.script}: {', '.join(f'{value} {name}' for name, value in count.items())}, all with the same scalars"
@@ -165,7 +166,10 @@ def cost(config: Config) -> None:
 
 
 def main(config: Config) -> None:
-    """Do all that is asked for, in a temporary folder."""
+    """Do all that is asked for, in a temporary folder. Raises ValueError for numbers that cannot work."""
+    for name, low in (("kills", 0), ("seconds", 0), ("iterations", 1), ("soak", 0)):
+        if getattr(config, name) < low:
+            raise ValueError(f"--{name} is {getattr(config, name)}; it must be {low} or more")
     torch.set_num_threads(1)  # forks must not inherit threads
     importlib.import_module("torch._dynamo")  # by the optimizer; else every fork spends most of its life on it
     with tempfile.TemporaryDirectory() as folder:
@@ -179,4 +183,9 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    try:
+        main(tyro.cli(Config))
+    except (ValueError, RuntimeError, OSError) as error:
+        sys.exit(f"survival.py: {' '.join(str(error).split())}")
+    except KeyboardInterrupt:
+        sys.exit(130)

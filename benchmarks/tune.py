@@ -394,7 +394,7 @@ def queue_killed_trials(study: optuna.Study, config: Config) -> None:
             study.enqueue_trial(trial.params, user_attrs=trial.user_attrs)
 
 
-def work(config: Config, worker: int, until: float) -> None:
+def work(config: Config, until: float) -> None:
     """Run trials until there are enough or until time.time() is `until`; raise what a training raises."""
     torch.set_num_threads(1)
     study = open_study(config)
@@ -403,11 +403,11 @@ def work(config: Config, worker: int, until: float) -> None:
     os.chdir(config.folder)  # a script makes its run folder in the current one
     try:
         while time.time() < until:
-            study.sampler = sampler(config, worker, len(study.get_trials(deepcopy=False)))
             with contextlib.ExitStack() as stack:
                 with locked(config.folder / "locks" / config.script):  # nobody sees a trial before it is locked
                     if len(study.get_trials(deepcopy=False, states=counted)) >= config.trials:
                         break
+                    study.sampler = sampler(config, len(study.get_trials(deepcopy=False)))
                     trial = study.ask(space_of(config.script))
                     stack.enter_context(locked(lock_path(config, trial.number)))
                 finish(study, trial, config)
@@ -415,9 +415,9 @@ def work(config: Config, worker: int, until: float) -> None:
         os.chdir(before)
 
 
-def sampler(config: Config, worker: int, trials: int) -> optuna.samplers.BaseSampler:
-    """Return a TPE sampler for the next trial, its seed another one for each, also where a search goes on."""
-    seed = int(np.random.SeedSequence([config.sampler_seed, worker, trials]).generate_state(1)[0])
+def sampler(config: Config, trials: int) -> optuna.samplers.BaseSampler:
+    """Return a TPE sampler for the next trial, after so many: its seed is another one for each."""
+    seed = int(np.random.SeedSequence([config.sampler_seed, trials]).generate_state(1)[0])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         # multivariate: a learning rate that suits two epochs need not suit four.
@@ -441,11 +441,11 @@ def finish(study: optuna.Study, trial: optuna.Trial, config: Config) -> None:
     print(f"trial {trial.number}: {result}, {found['seconds']:.0f} s", flush=True)
 
 
-def worker_process(config: Config, worker: int, until: float) -> None:
+def worker_process(config: Config, until: float) -> None:
     """Run trials in a process of its own; Ctrl-C is for the parent, which ends this one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    work(config, worker, until)
+    work(config, until)
 
 
 def search(config: Config) -> None:
@@ -455,11 +455,11 @@ def search(config: Config) -> None:
     processes = []
     try:
         if config.jobs == 1:
-            work(config, 0, until)
+            work(config, until)
             return
         os.environ["OMP_NUM_THREADS"] = "1"
         context = multiprocessing.get_context("spawn")
-        processes = [context.Process(target=worker_process, args=(config, i, until)) for i in range(config.jobs)]
+        processes = [context.Process(target=worker_process, args=(config, until)) for _ in range(config.jobs)]
         for process in processes:
             process.start()
         for process in processes:
@@ -633,3 +633,5 @@ if __name__ == "__main__":
         main(tyro.cli(Config))
     except (ValueError, OSError) as error:
         sys.exit(f"tune.py: {' '.join(str(error).split())}")
+    except KeyboardInterrupt:
+        sys.exit(130)

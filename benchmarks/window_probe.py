@@ -57,6 +57,7 @@ def main(config: Config) -> None:
         given = " ".join(map(str, config.windows)) or "empty"
         raise ValueError(f"--windows is {given}; give windows of 1 step or more")
     settings = evaluate.Config(levels=config.levels, repeats=config.repeats, max_steps=config.max_steps)
+    evaluate.check_numbers(settings)
     checkpoint = evaluate.Checkpoint.read(config.checkpoint, settings)
     if checkpoint.script is not ppo_trxl:
         script = checkpoint.script.__name__
@@ -74,3 +75,5 @@ if __name__ == "__main__":
         main(tyro.cli(Config))
     except (ValueError, OSError, ImportError, gym.error.Error) as error:
         sys.exit(f"window_probe.py: {' '.join(str(error).split())}")
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -196,8 +196,13 @@ def test_command(page, command):
         words = [given.training_script, *given.training_script_args]
     path, *arguments = words[1:] if words[0] == "-m" else words
     assert words[0] == "-m" or (ROOT / path).exists()
-    wrong = error(parser(import_program(path)), arguments)
+    module = import_program(path)
+    wrong = error(parser(module), arguments)
     assert wrong is None, f"{page}: {command}\n{wrong}"
+    if hasattr(module, "Args") and "--resume" not in arguments:
+        processes = int(given.nproc_per_node) * int(given.nnodes) if program == "torchrun" else 1
+        with patch.object(module, "rank_and_size", lambda: (0, processes)):
+            module.check_args(module.parse_args(arguments))
 
 
 DRAWN = sorted({call for _, call in COMMANDS.values() if "learning.py" in call and "--results benchmarks/res" in call})

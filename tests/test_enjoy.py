@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import importlib
 import io
 import json
 import os
@@ -398,8 +399,9 @@ def test_checkpoint_that_cannot_play(change, message, saved):
         enjoy.main(enjoy.Config("model.pt"))
 
 
-def test_episode_longer_than_the_memory_can_number(saved):
-    saved(ppo_trxl, trxl_positional_encoding="learned", trxl_pe_length=5)
+@pytest.mark.parametrize("query_position", [False, True])
+def test_episode_longer_than_the_memory_can_number(saved, query_position):
+    saved(ppo_trxl, trxl_positional_encoding="learned", trxl_pe_length=5, trxl_query_position=query_position)
     with pytest.raises(ValueError, match="--trxl-pe-length is 5, but an episode is longer"):
         enjoy.main(enjoy.Config("model.pt"))
 
@@ -414,6 +416,7 @@ def test_diverged_weights(saved):
 
 
 def test_missing_extra(monkeypatch):
-    monkeypatch.setattr(enjoy, "get_plotlyjs", None)
-    with pytest.raises(ImportError, match=re.escape('enjoy.py needs plotly and pillow: pip install -e ".[eval]"')):
-        enjoy.main(enjoy.Config("model.pt"))
+    monkeypatch.setitem(sys.modules, "plotly.offline", None)
+    monkeypatch.delitem(sys.modules, "enjoy")
+    with pytest.raises(SystemExit, match=re.escape('enjoy.py needs plotly.offline: pip install -e ".[eval]"')):
+        importlib.import_module("enjoy")

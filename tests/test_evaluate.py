@@ -116,6 +116,12 @@ def test_own_names_of_agents():
     assert set(evaluate.agents_of(runs)) == {"ppo_gru gamma=0.9", "new gamma=0.5", "ppo_gru gamma=0.5"}
 
 
+def test_an_argument_that_only_one_has_names_it():
+    """As of runs of a script from before and after a flag was added."""
+    runs = {"a": arguments("ppo_mine"), "b": arguments("ppo_mine", width=3)}
+    assert evaluate.agents_of(runs) == {"": ["a"], "width=3": ["b"]}
+
+
 def test_the_same_seed_twice_is_refused():
     with pytest.raises(ValueError, match="b is the same agent and seed, 1, as a; leave one of them out"):
         evaluate.agents_of({"a": arguments(), "b": arguments(cuda=False)})
@@ -587,6 +593,7 @@ BAD = {
     "nowhere.pt": "there is no file nowhere.pt",
     "notes.txt": "notes.txt is cut short, or neither a model nor a checkpoint",
     "MODEL --levels 0": r"--levels is 0; it must be from 1 to 2 \*\* 63 - 1",
+    "MODEL --levels 1000000000": "--levels x --repeats is 3000000000; at most 100000 fit",
     "MODEL --seed 99999999999999999999": r"--seed is 99999999999999999999; it must be from 0 to 2 \*\* 63 - 1",
     "cut.pt": "cut.pt is cut short, or neither a model nor a checkpoint",
     "MODEL --max-steps 0": "--max-steps is 0",

@@ -80,6 +80,25 @@ def test_an_agent_has_no_task_of_its_own(flags):
         learning.plan(learning.Config(), learning.TASKS["mortar-mayhem"], f"GRU {flags}", 1)
 
 
+@pytest.mark.parametrize(
+    ("agent", "seed", "message"),
+    [
+        ("GRU --num-envs 0", 1, "GRU --num-envs 0: --num-envs is 0; it must be 1 or more"),
+        ("GRU", -1, "GRU: --seed is -1; it must be 0 or more"),
+    ],
+)
+def test_what_a_script_refuses_is_told_before_anything_is_trained(agent, seed, message):
+    with pytest.raises(SystemExit, match=message):
+        learning.plan(learning.Config(), learning.TASKS["mortar-mayhem"], agent, seed)
+
+
+def test_leftovers_among_the_results_are_no_runs(tmp_path):
+    plan = learning.plan(learning.Config(), learning.TASKS["mortar-mayhem"], "GRU", 1)
+    for ending in ("json.gz.part", "txt"):
+        (tmp_path / f"{plan.task.env_id}__GRU__1__7.{ending}").touch()
+    assert learning.result_of(learning.Config(results=tmp_path), plan) is None
+
+
 def test_an_agent_goes_on_with_no_other_run(tmp_path):
     with pytest.raises(SystemExit, match="GRU --resume nowhere: --resume nowhere: there is no checkpoint"):
         learning.plan(learning.Config(), learning.TASKS["mortar-mayhem"], "GRU --resume nowhere", 1)
@@ -218,6 +237,15 @@ def test_a_row_of_the_table():
     assert " | never |  | 3.0 |" in learning.row("GRU", [run_with(2, 9, 10), run_with(7, 3, 8)], "coins", best=12.0)
     assert "| 8.00 | 8.00 | one seed |" in learning.row("GRU", [run_with(7, 3, 8)], "coins", best=12.0)
     assert "| the best is 0 |  | 3.0 |" in learning.row("GRU", [run_with(0, 0, 0)], "coins", best=0.0)
+
+
+def test_a_row_with_what_was_carried_out():
+    """Two runs of which the returns are 0.1 and 0.3, the best one being 0.4."""
+    runs = [run_with(1, 1, 1), run_with(1, 1, 1)]
+    for run, value in zip(runs, (0.1, 0.3), strict=True):
+        run.curves["eval/return"] = (run.curves["eval/coins"][0], np.full((3, 4, 2), value))
+    row = learning.row("GRU", runs, "coins", best=1.0, best_return=0.4)
+    assert row.startswith("| GRU | 1.00, 1.00 | 1.00 | 0.50 | 1.00 | ")
 
 
 def test_a_table_leaves_out_agents_without_runs_and_compares_with_the_best():

@@ -339,7 +339,7 @@ def test_packed_or_padded_is_the_same(played):
 
 
 class NoQuestions(TorchDispatchMode):
-    """Fails where the CPU asks the other device for numbers; what goes to it is counted by the operation."""
+    """Fails where the CPU asks the other device for numbers."""
 
     def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
         found = operation(*args, **(kwargs or {}))

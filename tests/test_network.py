@@ -77,6 +77,11 @@ def test_defaults_are_the_final_column_of_table_6_1():
         "num_layers": 1, "memory": "gru", "hidden_size": 512, "anneal_steps": 163_840_000,
     }  # fmt: skip
     assert {name: getattr(args, name) for name in final} == final
+    trxl = {
+        "trxl_num_layers": 3, "trxl_dim": 384, "trxl_num_heads": 4, "trxl_memory_length": 256, "trxl_init": "xavier",
+        "trxl_positional_encoding": "absolute", "trxl_layer_norm": "pre", "trxl_gate": "none",
+    }  # fmt: skip
+    assert {name: getattr(ppo_trxl.Args(), name) for name in trxl} == trxl
 
 
 def test_chunks_do_not_change_the_features(monkeypatch):

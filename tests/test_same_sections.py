@@ -1,5 +1,6 @@
 """The scripts are self-contained, so what they share stands in both: this holds the copies together."""
 
+import inspect
 import re
 from pathlib import Path
 
@@ -21,6 +22,16 @@ def test_shared_sections_are_the_same_to_the_byte():
     assert list(gru) == list(trxl) == sorted([*SHARED, *OWN])
     for name in SHARED:
         assert gru[name] == trxl[name], name
+
+
+def test_what_is_shared_of_the_other_sections():
+    for name in ("Bounds", "bounded", "UniqueObservations", "first_occurrences", "in_chunks"):
+        assert inspect.getsource(getattr(ppo_gru, name)) == inspect.getsource(getattr(ppo_trxl, name))
+    assert ppo_gru.CHUNK == ppo_trxl.CHUNK
+    gru, trxl = sections(ppo_gru)["1 ARGS"], sections(ppo_trxl)["1 ARGS"]
+    begin = "    preset: Literal"
+    shared = gru[gru.index(begin) : gru.index("    memory: Literal")]
+    assert shared == trxl[trxl.index(begin) : trxl.index("    trxl_num_layers:")]
 
 
 def test_flags_differ_in_the_memory_alone():

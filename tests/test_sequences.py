@@ -1,5 +1,7 @@
 """Cutting a rollout into pieces, padding them, and taking them apart again."""
 
+import itertools
+
 import pytest
 import torch
 
@@ -63,8 +65,11 @@ def test_minibatches_deal_every_step_once(seq_len):
 
 
 def test_no_minibatch_is_empty_at_the_limit_of_check_args():
-    pieces = Memory(Args(hidden_size=4), 4).cut(torch.zeros(16, 8, dtype=torch.bool))
-    assert [len(minibatch.first) for minibatch in pieces.minibatches(8)] == [1] * 8
+    memory = Memory(Args(hidden_size=4), 4)
+    for seed, rate in itertools.product(range(30), (0.0, 0.1, 0.5)):
+        torch.manual_seed(seed)
+        pieces = memory.cut(torch.rand(16, 8) < rate)
+        assert all(len(minibatch.first) for minibatch in pieces.minibatches(8))
 
 
 def test_no_piece_spans_an_episode_s_end():

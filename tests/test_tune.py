@@ -222,7 +222,7 @@ def test_a_search_finds_what_is_better_and_prunes_what_is_worse(quick, capsys):
 def test_a_killed_trial_is_tried_again_first(quick):
     study = tune.open_study(quick)
     study.ask(tune.space_of("ppo_gru"))
-    tune.work(replace(quick, trials=1), 0, math.inf)
+    tune.work(replace(quick, trials=1), math.inf)
     failed, again = trials_of(quick)
     assert (failed.state, again.state) == (TrialState.FAIL, TrialState.COMPLETE)
     assert failed.params == again.params
@@ -232,7 +232,7 @@ def test_a_killed_trial_is_tried_again_first(quick):
 def test_a_running_trial_is_left_alone(quick):
     running = tune.open_study(quick).ask(tune.space_of("ppo_gru"))
     with tune.locked(tune.lock_path(quick, running.number)):
-        tune.work(quick, 0, math.inf)
+        tune.work(quick, math.inf)
         assert [trial.state for trial in trials_of(quick)] == [TrialState.RUNNING, TrialState.COMPLETE]
 
 
@@ -269,10 +269,10 @@ def test_again(quick, capsys):
     assert f"| trial {numbers[0]} of search |" in capsys.readouterr().out
 
 
-def test_draws_differ_from_trial_to_trial_and_from_worker_to_worker(quick):
+def test_draws_differ_from_trial_to_trial(quick):
     drawn = set()
-    for worker, number in ((0, 1), (0, 2), (1, 1)):
-        study = optuna.create_study(sampler=tune.sampler(quick, worker, number))
+    for number in (1, 2, 3):
+        study = optuna.create_study(sampler=tune.sampler(quick, number))
         drawn.add(study.ask(tune.space_of("ppo_gru")).params["init_lr"])
     assert len(drawn) == 3
 

@@ -365,3 +365,5 @@ def test_initialization(scheme):
     assert block.attention.query.weight.std().item() == pytest.approx(deviation, rel=0.02)
     assert block.projection.weight.std().item() == pytest.approx(deviation * scale, rel=0.02)
     assert block.projection.bias.eq(0).all()
+    weight = block.attention.query.weight
+    assert torch.allclose(weight @ weight.T, torch.eye(384), atol=1e-4) == (scheme == "orthogonal")
