@@ -200,7 +200,7 @@ def test_command(page, command):
     wrong = error(parser(module), arguments)
     assert wrong is None, f"{page}: {command}\n{wrong}"
     if hasattr(module, "Args") and "--resume" not in arguments:
-        processes = int(given.nproc_per_node) * int(given.nnodes) if program == "torchrun" else 1
+        processes = int(given.nproc_per_node) * int(given.nnodes.split(":")[0]) if program == "torchrun" else 1
         with patch.object(module, "rank_and_size", lambda: (0, processes)):
             module.check_args(module.parse_args(arguments))
 

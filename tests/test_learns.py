@@ -36,9 +36,9 @@ def test_transformer_memory(tiny, scalars, encoding, gate):
 
 
 @pytest.mark.slow
-def test_with_bfloat16(tiny, scalars):
+@pytest.mark.parametrize(("script", "memory"), [(ppo_gru, {"hidden_size": 64}), (ppo_trxl, WINDOW)])
+def test_with_bfloat16(tiny, scalars, script, memory):
     # When the task is solved differs from processor to processor: 50 iterations instead of 30.
     steps = STEPS * 5 // 3
     settings = {**SETTINGS, "total_timesteps": steps, "anneal_steps": steps, "amp": True}
-    for script, memory in ((ppo_gru, {"hidden_size": 64}), (ppo_trxl, WINDOW)):
-        assert final_return(scalars, script, tiny(script, **memory, **settings)) >= 0.95
+    assert final_return(scalars, script, tiny(script, **memory, **settings)) >= 0.95
