@@ -237,13 +237,14 @@ def labels(agents: list[dict[str, Any]]) -> list[str]:
     differ = [key for key in keys if differs(key, agents)]
     bare = {"exp_name", "script"}
     words = [[args[k] if k in bare else f"{k}={args[k]}" for k in differ if k in args] for args in agents]
-    return [" ".join(dict.fromkeys(each)) for each in words]
+    return [" ".join(dict.fromkeys(each)) or args["exp_name"] for each, args in zip(words, agents, strict=True)]
 
 
 def differs(key: str, agents: list[dict[str, Any]]) -> bool:
     """Return whether an argument tells agents apart: by its values, or since some agents of a script lack it."""
     values = {args[key] for args in agents if key in args}
-    having = [{key in args for args in agents if args["script"] == script} for script in {a["script"] for a in agents}]
+    scripts = {args["script"] for args in agents}
+    having = [{key in args for args in agents if args["script"] == script} for script in scripts]
     return len(values) > 1 or any(len(each) > 1 for each in having)
 
 

@@ -119,7 +119,7 @@ def test_own_names_of_agents():
 def test_an_argument_that_only_one_has_names_it():
     """As of runs of a script from before and after a flag was added."""
     runs = {"a": arguments("ppo_mine"), "b": arguments("ppo_mine", width=3)}
-    assert evaluate.agents_of(runs) == {"": ["a"], "width=3": ["b"]}
+    assert evaluate.agents_of(runs) == {"ppo_mine": ["a"], "width=3": ["b"]}
 
 
 def test_the_same_seed_twice_is_refused():
