@@ -34,7 +34,8 @@ import learning
 from learning import TASKS, Task
 
 MORTAR_MAYHEM, MYSTERY_PATH = TASKS["mortar-mayhem"], TASKS["mystery-path"]
-FULL_MORTAR_MAYHEM, FULL_SPOTLIGHTS = TASKS["MortarMayhem-Grid-v0"], TASKS["SearingSpotlights-v0"]
+FULL_MORTAR_MAYHEM, FULL_MYSTERY_PATH = TASKS["MortarMayhem-Grid-v0"], TASKS["MysteryPath-v0"]
+FULL_SPOTLIGHTS = TASKS["SearingSpotlights-v0"]
 ENDLESS = TASKS["endless-mortar-mayhem"]
 LONG_ENDLESS = replace(ENDLESS, total_timesteps=12_000_000)
 FULL_ENDLESS = TASKS["Endless-MortarMayhem-v0"]
@@ -127,6 +128,10 @@ CLAIMS = {
         "6.2.1", "agents with a memory succeed more often than all others in Mystery Path Grid", MYSTERY_PATH,
         ("GRU", "TrXL"), (*FEW_FRAMES, "stack of 16"),
     ),
+    "memory-full-mystery-path": Claim(
+        "6.2.1", "agents with a memory succeed more often than all others in the full Mystery Path", FULL_MYSTERY_PATH,
+        ("GRU", WIDE_TRXL), (*FEW_FRAMES, "stack of 16"),
+    ),
     "stack-goal-in-view": Claim(
         "6.2.1", "with origin and goal in view, a stack of 16 solves Mystery Path Grid, fewer frames do not",
         GOAL_IN_VIEW, ("stack of 16", "GRU", "TrXL"), FEW_FRAMES,
@@ -158,6 +163,10 @@ CLAIMS = {
         "6.2.2", "TrXL takes fewer samples than GRU in the full Mortar Mayhem Grid", FULL_MORTAR_MAYHEM,
         (WIDE_TRXL,), ("GRU",), area,
     ),
+    "samples-full-mystery-path": Claim(
+        "6.2.2", "TrXL takes fewer samples than GRU in the full Mystery Path", FULL_MYSTERY_PATH,
+        (WIDE_TRXL,), ("GRU",), area,
+    ),
     "samples-full-spotlights": Claim(
         "6.2.2", "GRU takes fewer samples than TrXL in the full Searing Spotlights", FULL_SPOTLIGHTS,
         ("GRU",), (WIDE_TRXL,), area,
@@ -178,6 +187,10 @@ CLAIMS = {
         "6.2.3", "LSTM completes fewer commands than GRU in the full Mortar Mayhem Grid", FULL_MORTAR_MAYHEM,
         ("GRU",), ("LSTM",),
     ),
+    "lstm-full-mystery-path": Claim(
+        "6.2.3", "LSTM takes more samples than GRU in the full Mystery Path", FULL_MYSTERY_PATH,
+        ("GRU",), ("LSTM",), area,
+    ),
     "lstm-full-spotlights": Claim(
         "6.2.3", "LSTM takes more samples than GRU in the full Searing Spotlights", FULL_SPOTLIGHTS,
         ("GRU",), ("LSTM",), area,
@@ -185,6 +198,10 @@ CLAIMS = {
     "gates-full-mortar-mayhem": Claim(
         "6.2.3", "GTrXL completes fewer commands than TrXL in the full Mortar Mayhem Grid", FULL_MORTAR_MAYHEM,
         (WIDE_TRXL,), (WIDE_GTRXL,),
+    ),
+    "gates-full-mystery-path": Claim(
+        "6.2.3", "GTrXL takes more samples than TrXL in the full Mystery Path", FULL_MYSTERY_PATH,
+        (WIDE_TRXL,), (WIDE_GTRXL,), area,
     ),
     "gates-full-spotlights": Claim(
         "6.2.3", "GTrXL takes more samples than TrXL in the full Searing Spotlights", FULL_SPOTLIGHTS,
@@ -214,6 +231,10 @@ CLAIMS = {
     ),
     "falls": Claim(
         "6.5.2", "TrXL falls off less often than GRU in Mystery Path", MYSTERY_PATH, ("GRU",), ("TrXL",), falls
+    ),
+    "falls-full-mystery-path": Claim(
+        "6.5.2", "TrXL falls off less often than GRU in the full Mystery Path", FULL_MYSTERY_PATH,
+        ("GRU",), (WIDE_TRXL,), falls,
     ),
     "capacity": Claim(
         "7.1.1", "more width, blocks or window do not bring TrXL to GRU's level", ENDLESS, ("GRU",),
