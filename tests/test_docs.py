@@ -260,6 +260,25 @@ def test_readme_names_the_memory_interface(script):
         assert ["self", *parameters.split(", ")] == list(inspect.signature(called).parameters)
 
 
+def test_page_names_the_curves(tiny, scalars):
+    page = (ROOT / "docs/logging.md").read_text()
+    rows = re.findall(r"^\| (`\w+/.+?) \|", page, re.MULTILINE)
+    auxiliary = {"reconstruction_coef": 0.1, "ground_truth_coef": 0.1, "eval_interval": 1, "eval_levels": 2}
+    logged = set()
+    for script in SCRIPTS:
+        logged |= set(scalars(script.main(tiny(script, env_id="MortarMayhemB-Grid-v0", total_timesteps=1024, **auxiliary))))
+    logged = {re.sub("^(episode|eval)/.*", r"\1/NAME", name) for name in logged} | {"eval_levels/NAME"}
+    named = {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
+    assert named == logged
+
+
+def test_page_plays_an_agent(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    source = re.search(r"```python\n(.*?)```", (ROOT / "docs/logging.md").read_text(), re.DOTALL).group(1)
+    exec(source, {})
+    assert 0 < float(capsys.readouterr().out.split()[-1]) <= 1
+
+
 @each_page
 def test_nothing_is_left_open(page):
     assert "TODO" not in page.read_text()
