@@ -36,11 +36,7 @@ def test_verdicts(higher, lower, expects_difference, verdict):
 @pytest.mark.parametrize("name", claims.CLAIMS)
 def test_every_claim_compares_agents_that_can_be_trained(name):
     claim = claims.CLAIMS[name]
-    plans = [
-        learning.plan(claims.Config(), claim.task, agent, seed)
-        for agent in (*claim.higher, *claim.lower)
-        for seed in (1, 2)
-    ]
+    plans = [learning.plan(claims.Config(), claim.task, agent, 1) for agent in (*claim.higher, *claim.lower)]
     assert len({tuple(plan.logged_args().items()) for plan in plans}) == len(plans), "no two are the same"
 
 
