@@ -44,7 +44,7 @@ def test_recurrent_memory(tiny, trained, memory):
 
 @pytest.mark.slow
 def test_no_memory(tiny, trained):
-    args = tiny(memory="none", hidden_size=64, **SETTINGS | {"total_timesteps": STEPS * 3 // 5})
+    args = tiny(memory="none", hidden_size=64, **SETTINGS | {"total_timesteps": STEPS * 2 // 5})
     assert 0.4 <= trained(ppo_gru, args) <= 0.6
 
 
