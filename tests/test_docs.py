@@ -19,6 +19,7 @@ from unittest.mock import patch
 
 import gymnasium as gym
 import pytest
+import torch
 import tyro
 from torch.distributed import run as torchrun
 
@@ -276,6 +277,7 @@ def test_page_names_the_curves(tiny, scalars):
 def test_page_plays_an_agent(monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
     source = re.search(r"```python\n(.*?)```", (ROOT / "docs/logging.md").read_text(), re.DOTALL).group(1)
+    torch.manual_seed(1)
     exec(source, {})
     assert 0 < float(capsys.readouterr().out.split()[-1]) <= 1
 
