@@ -301,10 +301,9 @@ def verdict(claim: Claim, higher: np.ndarray, lower: np.ndarray) -> str:
     return "holds" if all(separated) else "does not hold" if any(reversed_) else "not decided"
 
 
-def row(name: str, config: Config, plans: list[learning.Plan]) -> str:
-    """Return a claim's row of the table, from the results of what was planned for it."""
+def row(name: str, plans: list[learning.Plan], results: list[evaluate.RunLog | None]) -> str:
+    """Return a claim's row of the table, from the results of what was planned for it, None where one is missing."""
     claim, numbers = CLAIMS[name], {}
-    results = [learning.result_of(config, plan) for plan in plans]
     if None in results:
         missing = f"not tested: {results.count(None)} of {len(results)} runs are missing"
         return f"| {claim.section} | {claim.text} | `{name}` | | {missing} |"
@@ -330,11 +329,13 @@ def main(config: Config) -> None:
         claim = CLAIMS[name]
         runs = itertools.product((*claim.higher, *claim.lower), config.seeds)
         plans[name] = [learning.plan(config, claim.task, agent, seed) for agent, seed in runs]
+    each_once = {plan.command: plan for plan in itertools.chain(*plans.values())}  # claims share runs
     if not config.report:
-        learning.train_missing(config, [*itertools.chain(*plans.values())])
+        learning.train_missing(config, [*each_once.values()])
+    results = {command: learning.result_of(config, plan) for command, plan in each_once.items()}
     print("| section | claim | name | mean of the seeds (lowest to highest) | verdict |\n|---|---|---|---|---|")
     for name in config.claims:
-        print(row(name, config, plans[name]))
+        print(row(name, plans[name], [results[plan.command] for plan in plans[name]]))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ nothing is trained.
 """
 
 import contextlib
+import functools
 import glob
 import importlib
 import json
@@ -238,6 +239,12 @@ def check(config: Training) -> None:
         raise SystemExit(f"--seeds is {' '.join(map(str, config.seeds)) or 'empty'}; give at least one, and each once")
 
 
+@functools.cache
+def parse(script: str, *flags: str) -> Any:
+    """Return what a script's flags stand for; tyro takes a tenth of a second, so that seeds and claims share it."""
+    return importlib.import_module(Path(script).stem).parse_args([*flags])
+
+
 def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
     """Plan a training run; an agent is a name in `AGENTS`, which further flags may follow.
 
@@ -249,7 +256,6 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
         "env_options": json.dumps(task.options),
         "total_timesteps": steps,
         "exp_name": file_name(agent),
-        "seed": seed,
     }
     name, dashes, further = agent.partition(" --")
     script, *memory = AGENTS[name].split()
@@ -258,21 +264,21 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
     for each, value in of_the_suite.items():
         flags += [f"--{each.replace('_', '-')}", str(value)]
     flags += f"{dashes}{further}".split()
-    module = importlib.import_module(Path(script).stem)
     try:
-        args = module.parse_args(flags)
-        module.check_args(args)
+        parsed = parse(script, *flags)
+        args = replace(parsed, seed=seed)
+        importlib.import_module(Path(script).stem).check_args(args)
     except (ValueError, OSError) as error:
         raise SystemExit(f"{agent}: {error}") from None
     theirs = {each: getattr(args, each) for each in of_the_suite}
-    if theirs != of_the_suite or args.eval_interval or args.resume:
+    if theirs != of_the_suite or parsed.seed != type(parsed).seed or args.eval_interval or args.resume:
         raise SystemExit(
             f"{agent}: an agent has no task, steps, name, seed or evaluations of its own, and goes on with no other "
             "run; use --tasks, --steps-scale, --seeds and --evaluations"
         )
     iterations = args.total_timesteps // (args.num_envs * args.num_steps)
     args.eval_interval = max(1, iterations // config.evaluations)
-    flags += ["--eval-interval", str(args.eval_interval)]
+    flags += ["--seed", str(seed), "--eval-interval", str(args.eval_interval)]
     return Plan(task, agent, seed, (sys.executable, str(ROOT / script), *flags), args)
 
 
@@ -375,8 +381,7 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
     """
     for folder in (config.folder, config.results):
         folder.mkdir(parents=True, exist_ok=True)
-    each_once = {plan.command: plan for plan in wanted}.values()
-    missing = [plan for plan in each_once if result_of(config, plan) is None]
+    missing = [plan for plan in wanted if result_of(config, plan) is None]
     steps = sum(plan.args.total_timesteps for plan in missing)
     before = sum(steps_so_far(config, plan) for plan in missing)  # of trainings that were stopped
     failed = []
