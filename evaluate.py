@@ -11,7 +11,7 @@ training set, three times each. An agent's score is the interquartile mean (IQM)
 episodes of its seeds, as the thesis pools 750 of them. Beside it stands the IQM of the levels' means, which is another
 number: where 70 % of the episodes succeed, the middle half has hardly a failure, but many levels have means below 1.
 The 95 % interval is that of a bootstrap that resamples whole seeds: how far the IQM would move with other seeds. Of
-three seeds it is no more than the range of their IQMs. A single seed has none.
+three seeds it is about the range of their IQMs. A single seed has none. The thesis' bootstrap is stratified (6.1.2).
 
 Shape letters: R seeds (training runs) of an agent, M levels, E episodes on each, I iterations of a run, P points of a
 curve, B bootstrap resamples.

@@ -413,40 +413,48 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
         raise SystemExit("; ".join(failed))
 
 
-def row(agent: str, runs: list[evaluate.RunLog], metric: str, best: float, best_return: float | None = None) -> str:
-    """Return the agent's row: its last score, the largest drop, and what nine tenths of the best agent's score took.
+def learning_curve(task: Task, run: evaluate.RunLog) -> tuple[np.ndarray, np.ndarray]:
+    """Return the steps (P,) of a run's evaluations, and the scores (P, M, E) by which agents are compared.
 
-    A drop is how far a seed's mean is below an earlier one. With best_return, the mean share of it stands beside the
-    mean score.
+    These are in the family's metric, but of a finite Mortar Mayhem the share of the commands that were carried out, by
+    the return: the metric counts a last command that failed as completed.
     """
-    steps, scores = evaluate.align([run.curves[f"eval/{metric}"] for run in runs])  # (P,), (P, R, M, E)
+    if task.best_return is None:
+        return run.curves[f"eval/{task.metric}"]
+    steps, returns = run.curves["eval/return"]
+    return steps, returns / task.best_return
+
+
+def row(agent: str, runs: list[evaluate.RunLog], task: Task, best: float) -> str:
+    """Return the agent's row: its last score, the largest drop, and what nine tenths of the best agent's IQM took.
+
+    A drop is how far a seed's mean is below an earlier one. The last columns are of the scores by which agents are
+    compared; if these are not the metric, their mean stands beside that of the metric.
+    """
+    scores = evaluate.align([run.curves[f"eval/{task.metric}"] for run in runs])[1]  # (P, R, M, E)
+    steps, compared = evaluate.align([learning_curve(task, run) for run in runs])  # (P,), (P, R, M, E)
     minutes = 60 * np.mean([run.hours(steps) for run in runs], 0)  # (P,), without evaluations
     ends = evaluate.interval(scores[-1])
     means = scores.mean((-2, -1))  # (P, R)
     drop = (np.maximum.accumulate(means) - means).max()
-    middle = evaluate.iqm(scores)  # (P,)
-    near = np.flatnonzero(middle >= 0.9 * best)
+    near = np.flatnonzero(evaluate.iqm(compared) >= 0.9 * best)
     taken = (f"{steps[near[0]]:,.0f}", f"{minutes[near[0]]:.1f}") if near.size else ("never", "")
     if best == 0:
         taken = ("the best is 0", "")
     span = "one seed" if ends is None else "{:.2f} to {:.2f}".format(*ends)
     each_seed = ", ".join(f"{mean:.2f}" for mean in means[-1])
     mean = f"{scores[-1].mean():.2f}"
-    if best_return is not None:
-        mean += f" | {last_scores('return', runs).mean() / best_return:.2f}"
-    reached = f"{each_seed} | {mean} | {middle[-1]:.2f} | {span} | {drop:.2f}"
+    if task.best_return is not None:
+        mean += f" | {compared[-1].mean():.2f}"
+    reached = f"{each_seed} | {mean} | {evaluate.iqm(scores[-1]):.2f} | {span} | {drop:.2f}"
     return f"| {agent} | {reached} | {' | '.join(taken)} | {minutes[-1]:.1f} |"
-
-
-def last_scores(metric: str, runs: list[evaluate.RunLog]) -> np.ndarray:
-    """Return the scores (R, M, E) of an agent's seeds at the end of training."""
-    return evaluate.align([run.curves[f"eval/{metric}"] for run in runs])[1][-1]
 
 
 def table(task: Task, agents: evaluate.Runs) -> str:
     """Return a task's table, a row for each agent that has runs, and below it what these took and on which machines."""
     runs_of = {agent: runs for agent, runs in agents.items() if runs}
-    best = max(float(evaluate.iqm(last_scores(task.metric, runs))) for runs in runs_of.values())
+    last = [evaluate.align([learning_curve(task, run) for run in runs])[1][-1] for runs in runs_of.values()]
+    best = max(float(evaluate.iqm(scores)) for scores in last)  # (R, M, E) each
     every_run = [run for runs in runs_of.values() for run in runs]
     hours = sum(run.seconds("iteration").sum() for run in every_run) / 3600
     machines = "; ".join(dict.fromkeys(run.machine for run in every_run))
@@ -458,7 +466,7 @@ def table(task: Task, agents: evaluate.Runs) -> str:
         f"{task.metric} after {int(every_run[0].args['total_timesteps']):,} steps\n",
         f"| {' | '.join(header)} |",
         f"|{'|'.join('---' if name in left else '---:' for name in header)}|",
-        *(row(agent, runs, task.metric, best, task.best_return) for agent, runs in runs_of.items()),
+        *(row(agent, runs, task, best) for agent, runs in runs_of.items()),
         f"\nRuns: {len(every_run)}, together {hours:.1f} hours without evaluations. Machines: {machines}",
     ]
     return "\n".join(lines)
@@ -475,7 +483,7 @@ def overview(tasks: dict[str, evaluate.Runs]) -> str:
     def cell(task: Task, runs: list[evaluate.RunLog]) -> str:
         if not runs:
             return ""
-        scores = last_scores(task.metric, runs)
+        scores = evaluate.align([run.curves[f"eval/{task.metric}"] for run in runs])[1][-1]  # (R, M, E)
         few = f", {len(runs)} seed{'s' * (len(runs) > 1)}" if len(runs) < most else ""
         return f"{evaluate.iqm(scores):.2f} ({scores.mean():.2f}){few}"
 

@@ -55,7 +55,7 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
         plans = [learning.plan(config, claims.ALL_IN_VIEW, agent, seed) for seed in (1, 2)]
         norms[agent] = [learning.result_of(config, plan).curves["losses/grad_norm"][1].mean() for plan in plans]
     figures = [f"{agent} {np.mean(x):.3g} ({min(x):.3g} to {max(x):.3g})" for agent, x in norms.items()]
-    row = "| 7.2 | normalized advantages make gradients larger (12 times) | `normalized-gradients` | gradient norm: "
+    row = "| 7.2 | normalized advantages make gradients larger | `normalized-gradients` | gradient norm: "
     assert told.splitlines()[-1].startswith(row + "; ".join(figures))
     claims.main(config)
     assert "trained" not in capsys.readouterr().out

@@ -207,7 +207,7 @@ def test_runs_share_the_cores_unless_told_how_many_threads_to_have(tmp_path, mon
     assert log.read_text() == "3\n7\n3\n"
 
 
-def run_with(*means, metric="eval/coins"):
+def run_with(*means, metric="eval/coins_collected"):
     """Return a run that has these scores on all four levels, twice each, after 100, 200 and 300 steps."""
     steps = np.array([100, 200, 300])
     scores = np.broadcast_to(np.reshape(means, (3, 1, 1)), (3, 4, 2))
@@ -232,20 +232,23 @@ def test_a_log_tells_how_far_its_training_is(tmp_path):
 
 
 def test_a_row_of_the_table():
-    row = learning.row("GRU", [run_with(2, 9, 10), run_with(7, 3, 8)], "coins", best=6.0)
-    assert row == "| GRU | 10.00, 8.00 | 9.00 | 9.00 | 8.00 to 10.00 | 4.00 | 200 | 2.0 | 3.0 |", "one fell from 7 to 3"
-    assert " | never |  | 3.0 |" in learning.row("GRU", [run_with(2, 9, 10), run_with(7, 3, 8)], "coins", best=12.0)
-    assert "| 8.00 | 8.00 | one seed |" in learning.row("GRU", [run_with(7, 3, 8)], "coins", best=12.0)
-    assert "| the best is 0 |  | 3.0 |" in learning.row("GRU", [run_with(0, 0, 0)], "coins", best=0.0)
+    task, fallen = learning.TASKS["Endless-SearingSpotlights-v0"], run_with(7, 3, 8)  # it fell from 7 to 3
+    row = learning.row("GRU", [run_with(2, 9, 10), fallen], task, best=6.0)
+    assert row == "| GRU | 10.00, 8.00 | 9.00 | 9.00 | 8.00 to 10.00 | 4.00 | 200 | 2.0 | 3.0 |"
+    assert " | never |  | 3.0 |" in learning.row("GRU", [run_with(2, 9, 10), fallen], task, best=12.0)
+    assert "| 8.00 | 8.00 | one seed |" in learning.row("GRU", [fallen], task, best=12.0)
+    assert "| the best is 0 |  | 3.0 |" in learning.row("GRU", [run_with(0, 0, 0)], task, best=0.0)
 
 
-def test_a_row_with_what_was_carried_out():
-    """Two runs of which the returns are 0.1 and 0.3, the best one being 0.4."""
-    runs = [run_with(1, 1, 1), run_with(1, 1, 1)]
-    for run, value in zip(runs, (0.1, 0.3), strict=True):
-        run.curves["eval/return"] = (run.curves["eval/coins"][0], np.full((3, 4, 2), value))
-    row = learning.row("GRU", runs, "coins", best=1.0, best_return=0.4)
-    assert row.startswith("| GRU | 1.00, 1.00 | 1.00 | 0.50 | 1.00 | ")
+def test_agents_of_finite_mortar_mayhem_are_compared_by_what_they_carried_out():
+    """Both complete all four commands by the metric from the first evaluation on, and carry out some of them."""
+    task = learning.TASKS["mortar-mayhem"]
+    slow, fast = (run_with(1, 1, 1, metric="eval/commands_completed") for _ in range(2))
+    for run, returns in ((slow, (0.1, 0.1, 0.3)), (fast, (0.1, 0.4, 0.4))):
+        run.curves["eval/return"] = run_with(*returns).curves["eval/coins_collected"]
+    table = learning.table(task, {"slow": [slow], "fast": [fast]}).splitlines()
+    assert "| slow | 1.00 | 1.00 | 0.75 | 1.00 | one seed | 0.00 | never |  | 3.0 |" in table
+    assert "| fast | 1.00 | 1.00 | 1.00 | 1.00 | one seed | 0.00 | 200 | 2.0 | 3.0 |" in table
 
 
 def test_a_table_leaves_out_agents_without_runs_and_compares_with_the_best():
