@@ -4,11 +4,11 @@
 
 The agent gets one observation at a time and carries a hidden state from step to step, zeroed where an episode ends.
 The rollout stores the hidden state that each step began with. For the update, the steps of each environment are cut
-into sequences at the ends of episodes (and every --seq-len steps), padded with zeros to the longest sequence (on a CPU
-packed, section 9), and unrolled from the stored hidden state of their first step: truncated back-propagation through
-time. The gradient reaches back to the first step of the sequence. The hidden state that a rollout starts from was
-computed with older weights. So are, after the first epoch, those that --seq-len starts sequences from; --refresh-memory
-recomputes these before each epoch but the first.
+into sequences at the ends of episodes (and every --seq-len steps), padded with zeros to the longest sequence (the
+GRU's on a CPU are packed instead, section 9), and unrolled from the stored hidden state of their first step: truncated
+back-propagation through time. The gradient reaches back to the first step of the sequence. The hidden state that a
+rollout starts from was computed with older weights. So are, from the first gradient step on, those that --seq-len
+starts sequences from; --refresh-memory recomputes these before each epoch but the first.
 
 Source: "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", called the thesis below.
 §5.2 is its section, (5.7) its equation; defaults are the "Final" column of its table 6.1.
@@ -97,7 +97,7 @@ class Args:
     exp_name: str = "ppo_gru"
     """name of the experiment, part of the run folder's name"""
     preset: Literal["thesis", "laptop"] = "thesis"
-    """a set of defaults, listed above, that the command line begins with; flags that are given win over it (in Python:
+    """a set of defaults (`PRESETS`) that the command line begins with; flags that are given win over it (in Python:
     Args(**PRESETS["laptop"]))"""
     seed: NonNegativeInt = 1
     """seed of the weights, the actions and the environments: same seed, same curves (on the CPU to the last bit)"""
@@ -106,7 +106,7 @@ class Args:
     cuda: bool = True
     """train on the GPU when there is one"""
     amp: bool = False
-    """compute encoder, transformer and decoder in bfloat16, faster on processors that have it; the rest is float32"""
+    """compute encoder and decoder, and a transformer, in bfloat16, faster on processors that have it"""
     track: bool = False
     """log to Weights and Biases too (needs the extra `track`)"""
     wandb_project_name: str = "memory-gym-baselines"
@@ -205,8 +205,8 @@ class Args:
     ground_truth_detach: bool = False
     """estimate the ground truth without teaching the agent: a probe of what its memory holds"""
     embedding: bool = True
-    """embed the encoded observation in the memory's width; without, the memory takes it as it is (a transformer only if
-    --trxl-dim is its width)"""
+    """embed the encoded observation in the memory's width; without, the memory takes it as it is (in ppo_trxl.py
+    only if --trxl-dim is its width)"""
     head_size: PositiveInt = 512
     """width of the layer after the memory, and of the heads' own layers"""
     value_init_gain: NonNegativeFloat = 1.0
@@ -421,8 +421,8 @@ class Pieces:
         """Shuffle the pieces, and distribute them, whole, over count minibatches of about the same number of steps."""
         order = torch.randperm(len(self.first))
         first, length = self.first[order], self.length[order]
-        # (S,) the one that a piece goes to, by where its first step falls. None is empty: `check_args` makes sure that
-        # no piece is longer than a minibatch's share of the steps.
+        # (S,) the minibatch of each piece, by the position of its first step. No minibatch is empty: `check_args` makes
+        # sure that no piece is longer than a minibatch's share of the steps.
         minibatch = (length.cumsum(0) - length) * count // length.sum()
         sizes = minibatch.bincount(minlength=count).tolist()
         for mb_first, mb_length in zip(first.split(sizes), length.split(sizes), strict=True):
@@ -575,11 +575,11 @@ class Decoder(nn.Sequential):
 #   step, reset                    take a step, which also stores what the update needs; forget where an episode ended
 #   cut, unroll                    cut a rollout into pieces; compute whole pieces at once in the update
 #   rewind                         go back to the rollout's first step, to store all of it again (--refresh-memory)
-#   logs                           numbers for TensorBoard
+#   logs                           numbers for TensorBoard, averaged over processes (maxima: `combine_processes`)
 #   not_saved                      fields of the state that no checkpoint holds
 #   width                          D, the width of what comes out
-# Section 1 has what is known before it is made: its flags, those in PRESETS and NETWORK_FLAGS, memory_width and
-# longest_piece.
+# Section 1 has what is known before it is made: its flags, those in PRESETS, NETWORK_FLAGS and NEEDS, memory_width
+# and longest_piece.
 class MemoryState(NamedTuple):
     """What N environments remember. `t` and `hidden` are replaced step by step, `stored` is written in place."""
 
@@ -645,7 +645,7 @@ class Memory(nn.Module):
         starts[1:] = done[:-1]
         if self.seq_len:
             t = torch.arange(len(done))[:, None]
-            began = torch.where(starts, t, 0).cummax(0).values  # (T, N) the step that the episode began at
+            began = torch.where(starts, t, 0).cummax(0).values  # (T, N) the episode's first step in this rollout
             starts = (t - began) % self.seq_len == 0
         return Pieces.from_starts(starts)
 
@@ -896,23 +896,31 @@ def update(
     pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
     clipped_together = groups_to_clip(agent, args)
     logs = []
-    for minibatch in minibatches_of_all_epochs(agent, rollout, pieces, args):
-        loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
-        if args.target_kl is not None and logs:  # before the first step, the policy is still the one that acted
-            kl = np.mean(all_gather(log["approx_kl"].item()))  # section 8: of all processes, which stop together
-            if kl > args.target_kl:
-                break
-        optimizer.zero_grad()
-        loss.backward()
-        average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
-        norms = [nn.utils.clip_grad_norm_(group, args.max_grad_norm) for group in clipped_together]
-        log |= {"grad_norm": norms[0], "largest_norm": torch.stack(norms).max()}
-        optimizer.step()
-        logs.append(log)
+    too_far = False  # for --target-kl
+    for epoch in range(args.update_epochs):
+        if args.refresh_memory and epoch > 0:
+            refresh_memory(agent, rollout, args)
+        for minibatch in pieces.minibatches(args.num_minibatches):
+            loss, log = ppo_loss(agent, rollout, observations, minibatch, ent_coef, args)
+            if args.target_kl is not None and logs:  # before the first step, the policy is still the one that acted
+                kl = np.mean(all_gather(log["approx_kl"].item()))  # section 8: of all processes, which stop together
+                too_far = kl > args.target_kl
+                if too_far:
+                    break
+            optimizer.zero_grad()
+            loss.backward()
+            average_gradients(agent, int(minibatch.length.sum()))  # section 8: over processes, if there are several
+            norms = [nn.utils.clip_grad_norm_(group, args.max_grad_norm) for group in clipped_together]
+            log |= {"grad_norm": norms[0], "largest_norm": torch.stack(norms).max()}
+            optimizer.step()
+            logs.append(log)
+        if too_far:
+            break
 
     means = torch.stack([torch.stack([*log.values()]) for log in logs]).mean(0)  # over minibatches
     losses = dict(zip(logs[0], means.tolist(), strict=True))  # asks a GPU once, for all minibatches
-    if not math.isfinite(losses["loss"] + losses.pop("largest_norm")):
+    largest_norm = losses.pop("largest_norm")
+    if not math.isfinite(losses["loss"] + largest_norm):
         raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
     # Before the first gradient step the weights are those that acted, so every ratio has to be 1.
     losses["ratio_error"] = logs[0]["ratio_error"].item()
@@ -920,14 +928,6 @@ def update(
     padding = 1 - float(pieces.length.float().mean() / pieces.length.max())  # if all were padded to the longest
     charts = {"gradient_steps": len(logs), "padding_fraction": padding, **agent.memory.logs(rollout.memory_state)}
     return {f"losses/{k}": v for k, v in losses.items()} | {f"charts/{k}": v for k, v in charts.items()}
-
-
-def minibatches_of_all_epochs(agent: Agent, rollout: Rollout, pieces: Pieces, args: Args) -> Iterator[Pieces]:
-    """Yield the minibatches of one epoch after the other, all of a rollout's pieces in each."""
-    for epoch in range(args.update_epochs):
-        if args.refresh_memory and epoch > 0:
-            refresh_memory(agent, rollout, args)
-        yield from pieces.minibatches(args.num_minibatches)
 
 
 def groups_to_clip(agent: Agent, args: Args) -> list[list[nn.Parameter]]:
@@ -1000,7 +1000,7 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
     obs, _ = envs.reset(seed=levels)
     state = agent.memory.initial_state(len(levels), memory_steps, device)
     playing = np.ones(len(levels), bool)
-    found = {"return": np.zeros(len(levels)), "length": np.zeros(len(levels))}
+    metrics = {"return": np.zeros(len(levels)), "length": np.zeros(len(levels))}
     with autocast(args, device):
         for t in range(args.eval_max_steps):
             if t % memory_steps == 0:
@@ -1009,15 +1009,15 @@ def evaluate(agent: Agent, envs: gym.vector.VectorEnv, args: Args, memory_steps:
             obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
             done = terminated | truncated
             state = agent.memory.reset(state, torch.as_tensor(done))
-            found["return"] += rewards * playing
-            found["length"] += playing
+            metrics["return"] += rewards * playing
+            metrics["length"] += playing
             for name, which, values in final_numbers(infos, done & playing):
                 if name not in ("return", "length"):  # counted above; the environment's own of these names are ignored
-                    found.setdefault(name, np.full(len(levels), np.nan))[which] = values
+                    metrics.setdefault(name, np.full(len(levels), np.nan))[which] = values
             playing &= ~done
             if not playing.any():
                 break
-    return found | {"finished": 1.0 - playing}
+    return metrics | {"finished": 1.0 - playing}
 
 
 def level_scores(args: Args, run: "Run") -> dict[str, Tensor]:
@@ -1032,17 +1032,17 @@ def level_scores(args: Args, run: "Run") -> dict[str, Tensor]:
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(args.seed)
         try:
-            found = evaluate(run.agent, run.eval_envs, args)
+            metrics = evaluate(run.agent, run.eval_envs, args)
         except MemoryLimit as error:
             tqdm.write(f"no evaluation: {error}", file=sys.stderr)
             return {}
-    complete = {name: torch.from_numpy(values) for name, values in found.items() if not np.isnan(values).any()}
+    complete = {name: torch.from_numpy(values) for name, values in metrics.items() if not np.isnan(values).any()}
     return {name: values.unflatten(0, (-1, args.eval_repeats)) for name, values in complete.items()}
 
 
 # ---- 8 RUNNING ----
 class RunError(RuntimeError):
-    """Training cannot go on, for a reason outside of it: a full disk, a process that is gone. Says which, in a line."""
+    """Training cannot go on for a reason outside of it, as a full disk; the message is one line that names it."""
 
 
 @dataclass
@@ -1055,7 +1055,7 @@ class Run:
     optimizer: torch.optim.Optimizer
     rollout: Rollout
     folder: Path
-    writer: SummaryWriter | None = None  # as the progress bar, the first process's alone
+    writer: SummaryWriter | None = None  # only in the first process, as the progress bar
     bar: tqdm | None = None
     iteration: int = 0  # the current one, from 1
     step: int = 0  # so far, of all environments together
@@ -1391,9 +1391,9 @@ def combine_processes(parts: list[tuple[dict, dict, int]]) -> tuple[dict[str, fl
     Maxima over samples are maxima over processes.
     """
     logs, episodes, signals = zip(*parts, strict=True)
-    found = {name: [each[name] for each in logs if name in each] for name in logs[0]}
+    values_of = {name: [each[name] for each in logs if name in each] for name in logs[0]}
     maxima = ("losses/ratio_error", "charts/memory_window")
-    logs = {name: max(values) if name in maxima else float(np.mean(values)) for name, values in found.items()}
+    logs = {name: max(values) if name in maxima else float(np.mean(values)) for name, values in values_of.items()}
     joined = defaultdict(list)
     for each in episodes:
         for name, values in each.items():
@@ -1472,7 +1472,11 @@ def state_of_process(run: Run) -> dict[str, Any]:
         "environments": save_state(run.envs),
         "next_obs": rollout.next_obs,
         "next_ground_truth": rollout.next_ground_truth,
-        "memory": {name: part for name, part in memory.items() if name not in not_saved},
+        "memory": {
+            name: part.cpu() if isinstance(part, Tensor) else part
+            for name, part in memory.items()
+            if name not in not_saved
+        },
         "torch": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state(rollout.values.device) if rollout.values.is_cuda else None,
         "numpy": np.random.get_state(),  # noqa: NPY002 (it and Python's: environments of other packages may use them)
@@ -1581,7 +1585,7 @@ def read_model(path: str | Path) -> dict[str, Any]:
     try:
         saved = torch.load(content, map_location="cpu", weights_only=True)
         return {**saved, "script": saved["script"], "args": dict(saved["args"]), "weights": dict(saved["weights"])}
-    except Exception:  # what torch.load raises for a file of another kind is many things, and none tells more
+    except Exception:  # torch.load raises many kinds of errors for a wrong file, and none tells more
         raise ValueError(f"{path} is cut short, or neither a model nor a checkpoint") from None
 
 
@@ -1631,7 +1635,7 @@ def stop_on_signals(run: Run) -> None:
 def close(run: Run) -> None:
     """Close all files, environments and connections."""
     for each in filter(None, (run.bar, run.envs, run.eval_envs, run.writer, run.lock)):
-        with contextlib.suppress(OSError):  # a writer that cannot write has said so before
+        with contextlib.suppress(OSError):  # that a file cannot be written was reported before
             each.close()
     if dist.is_initialized():
         dist.destroy_process_group()
@@ -1718,7 +1722,7 @@ def in_chunks(network: Callable, x: Tensor) -> Tensor:
 
 
 def packed_gru(rnn: nn.GRU, x: Tensor, pieces: Pieces, hidden: Tensor) -> Tensor:
-    """Run a GRU over sequences without padding: x (B, D), piece after piece, from hidden (S, P, D), to (B, D).
+    """Run a GRU over sequences without padding: x (B, I), piece after piece, from hidden (S, P, D), to (B, D).
 
     Computes what `Memory.unroll` does with padding. The order is that of torch's PackedSequence: the first step of all
     sequences, the longest first, then the second step of those that have one, and so on.
@@ -1728,7 +1732,7 @@ def packed_gru(rnn: nn.GRU, x: Tensor, pieces: Pieces, hidden: Tensor) -> Tensor
     rank = longest_first.argsort().repeat_interleave(pieces.length)  # (B,) of the step's sequence
     order = (column * len(longest_first) + rank).argsort()
     sizes = column.bincount().tolist()  # (L,) number of sequences that have a first step, a second ...
-    y, hidden = x[order], hidden[longest_first].transpose(0, 1)  # (B, D), (P, S, D)
+    y, hidden = x[order], hidden[longest_first].transpose(0, 1)  # (B, I), (P, S, D)
     with torch.autocast("cpu", enabled=False):
         for first, (w_input, w_hidden, b_input, b_hidden) in zip(hidden, rnn.all_weights, strict=True):
             y = GRUScan.apply(F.linear(y, w_input, b_input), first, w_hidden, b_hidden, sizes)
@@ -1800,7 +1804,7 @@ if __name__ == "__main__":
     except (ValueError, OSError, ImportError, gym.error.Error, RunError) as error:
         sys.exit(f"{Path(__file__).name}: {' '.join(str(error).split())}")
     stop_on_signals(run)
-    # What TensorBoard's thread cannot write, its next call raises in this one.
+    # If TensorBoard's thread fails to write, the next call to the writer raises here.
     threading.excepthook = lambda it: None if "tensorboard" in repr(type(it.thread)) else threading.__excepthook__(it)
     try:
         run_to_end(args, run)
