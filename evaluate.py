@@ -476,21 +476,21 @@ def add_legend(figure: Figure, tasks: dict[str, Runs], styles: dict[str, dict]) 
 
 
 def draw_tasks(
-    tasks: dict[str, Runs], out: str, metrics: tuple[str, ...] = (), over: str = "steps"
+    tasks: dict[str, Runs], out: str, metrics: dict[str, tuple[str, ...]], over: str = "steps"
 ) -> dict[str, dict[str, dict[str, np.ndarray]]]:
     """Draw each task and metric to OUT.png and OUT.svg; tasks: the runs, if any, by the task's title and agent's label.
 
-    Without metrics, the family's own. Return the last scores (R, M, E) by title, label and name of the curve.
+    Metrics are by title, as many for each task. Return the last scores (R, M, E) by title, label and name of the curve.
     """
     labels = dict.fromkeys(itertools.chain(*tasks.values()))  # also of agents without runs: others keep their colours
     looks = itertools.cycle(itertools.product(("-", "--", ":"), color_sequences["tab10"]))
     styles = {label: {"linestyle": line, "color": color} for label, (line, color) in zip(labels, looks, strict=False)}
     tasks = {title: {label: runs for label, runs in agents.items() if runs} for title, agents in tasks.items()}
-    figure, grid = blank_pictures(len(tasks), len(metrics) or 1)
+    figure, grid = blank_pictures(len(tasks), max(map(len, metrics.values())))
     last = defaultdict(lambda: defaultdict(dict))
     for axes, (title, agents) in zip(grid, tasks.items(), strict=True):
         every_run = list(itertools.chain(*agents.values()))
-        for axis, metric in zip(axes, metrics or [own_metric(every_run[0].args["env_id"])], strict=True):
+        for axis, metric in zip(axes, metrics[title], strict=True):
             name = curve_name(metric, every_run)
             for label, scores in draw_metric(axis, name, agents, styles, over).items():
                 last[title][label][name] = scores
@@ -564,7 +564,9 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
         title: {label: [runs_by_path[path] for path in members] for label, members in agents.items()}
         for title, agents in paths.items()
     }
-    last = draw_tasks(tasks, config.out, config.metrics, config.over)
+    env_ids = {title: runs_by_path[next(iter(agents.values()))[0]].args["env_id"] for title, agents in paths.items()}
+    metrics = {title: config.metrics or (own_metric(env_id),) for title, env_id in env_ids.items()}
+    last = draw_tasks(tasks, config.out, metrics, config.over)
     report = []
     for title, agents in tasks.items():
         summaries = [summary(label, paths[title][label], last[title][label]) for label in agents]

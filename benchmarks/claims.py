@@ -61,13 +61,13 @@ NOT_NORMALIZED, NORMALIZED = "GRU --target-kl None", "GRU --target-kl None --nor
 
 
 def score(task: Task, run: evaluate.RunLog) -> float:
-    """Return the mean of a run's last evaluation; see `learning.learning_curve`."""
-    return learning.learning_curve(task, run)[1][-1].mean()
+    """Return the mean of a run's last evaluation."""
+    return run.curves[f"eval/{task.score}"][1][-1].mean()
 
 
 def area(task: Task, run: evaluate.RunLog) -> float:
     """Return the mean of a run's learning curve: it is higher where fewer samples are needed."""
-    return learning.learning_curve(task, run)[1].mean()
+    return run.curves[f"eval/{task.score}"][1].mean()
 
 
 def falls(task: Task, run: evaluate.RunLog) -> float:

@@ -91,11 +91,17 @@ class Task:
 
     @property
     def best_return(self) -> float | None:
-        """Return what all commands of a finite Mortar Mayhem pay, None for other tasks.
-
-        Its metric counts a last command as completed even if it failed, as the original's does. The return does not.
-        """
+        """Return what all commands of a finite Mortar Mayhem pay, None for other tasks."""
         return 0.1 * self.options.get("command_count", [10])[0] if self.env_id.startswith("MortarMayhem") else None
+
+    @property
+    def score(self) -> str:
+        """Return the name of the score by which agents are compared: the metric, or what they carried out.
+
+        That is a finite Mortar Mayhem's share of the commands by the return (`result_of`). Its metric, as the
+        original's, counts a last command as completed even if it failed.
+        """
+        return self.metric if self.best_return is None else "carried_out"
 
 
 SMALL = {
@@ -293,8 +299,12 @@ def runs_in(place: str, plan: Plan) -> list[evaluate.RunLog]:
 
 
 def result_of(config: Training, plan: Plan) -> evaluate.RunLog | None:
-    """Return the finished run, if its result is there."""
-    return next(iter(runs_in(str(config.results), plan)), None)
+    """Return the finished run, if its result is there, with the curve `eval/{plan.task.score}`."""
+    run = next(iter(runs_in(str(config.results), plan)), None)
+    if run is not None and plan.task.best_return is not None:
+        steps, returns = run.curves["eval/return"]
+        run.curves[f"eval/{plan.task.score}"] = steps, returns / plan.task.best_return
+    return run
 
 
 def is_complete(run: evaluate.RunLog) -> bool:
@@ -413,57 +423,49 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
         raise SystemExit("; ".join(failed))
 
 
-def learning_curve(task: Task, run: evaluate.RunLog) -> tuple[np.ndarray, np.ndarray]:
-    """Return the steps (P,) of a run's evaluations, and the scores (P, M, E) by which agents are compared.
-
-    These are in the family's metric, but of a finite Mortar Mayhem the share of the commands that were carried out, by
-    the return: the metric counts a last command that failed as completed.
-    """
-    if task.best_return is None:
-        return run.curves[f"eval/{task.metric}"]
-    steps, returns = run.curves["eval/return"]
-    return steps, returns / task.best_return
-
-
 def row(agent: str, runs: list[evaluate.RunLog], task: Task, best: float) -> str:
     """Return the agent's row: its last score, the largest drop, and what nine tenths of the best agent's IQM took.
 
-    A drop is how far a seed's mean is below an earlier one. The last columns are of the scores by which agents are
-    compared; if these are not the metric, their mean stands beside that of the metric.
+    A drop is how far a seed's mean is below an earlier one. If the task's score is not its metric, the mean of the
+    metric stands beside that of the score.
     """
-    scores = evaluate.align([run.curves[f"eval/{task.metric}"] for run in runs])[1]  # (P, R, M, E)
-    steps, compared = evaluate.align([learning_curve(task, run) for run in runs])  # (P,), (P, R, M, E)
+    steps, scores = evaluate.align([run.curves[f"eval/{task.score}"] for run in runs])  # (P,), (P, R, M, E)
     minutes = 60 * np.mean([run.hours(steps) for run in runs], 0)  # (P,), without evaluations
     ends = evaluate.interval(scores[-1])
     means = scores.mean((-2, -1))  # (P, R)
     drop = (np.maximum.accumulate(means) - means).max()
-    near = np.flatnonzero(evaluate.iqm(compared) >= 0.9 * best)
+    middle = evaluate.iqm(scores)  # (P,)
+    near = np.flatnonzero(middle >= 0.9 * best)
     taken = (f"{steps[near[0]]:,.0f}", f"{minutes[near[0]]:.1f}") if near.size else ("never", "")
     if best == 0:
         taken = ("the best is 0", "")
     span = "one seed" if ends is None else "{:.2f} to {:.2f}".format(*ends)
     each_seed = ", ".join(f"{mean:.2f}" for mean in means[-1])
     mean = f"{scores[-1].mean():.2f}"
-    if task.best_return is not None:
-        mean += f" | {compared[-1].mean():.2f}"
-    reached = f"{each_seed} | {mean} | {evaluate.iqm(scores[-1]):.2f} | {span} | {drop:.2f}"
+    if task.score != task.metric:
+        mean += f" | {last_scores(task.metric, runs).mean():.2f}"
+    reached = f"{each_seed} | {mean} | {middle[-1]:.2f} | {span} | {drop:.2f}"
     return f"| {agent} | {reached} | {' | '.join(taken)} | {minutes[-1]:.1f} |"
+
+
+def last_scores(name: str, runs: list[evaluate.RunLog]) -> np.ndarray:
+    """Return the scores (R, M, E) of an agent's seeds at the end of training, by the name of a metric or score."""
+    return evaluate.align([run.curves[f"eval/{name}"] for run in runs])[1][-1]
 
 
 def table(task: Task, agents: evaluate.Runs) -> str:
     """Return a task's table, a row for each agent that has runs, and below it what these took and on which machines."""
     runs_of = {agent: runs for agent, runs in agents.items() if runs}
-    last = [evaluate.align([learning_curve(task, run) for run in runs])[1][-1] for runs in runs_of.values()]
-    best = max(float(evaluate.iqm(scores)) for scores in last)  # (R, M, E) each
+    best = max(float(evaluate.iqm(last_scores(task.score, runs))) for runs in runs_of.values())
     every_run = [run for runs in runs_of.values() for run in runs]
     hours = sum(run.seconds("iteration").sum() for run in every_run) / 3600
     machines = "; ".join(dict.fromkeys(run.machine for run in every_run))
-    carried_out = () if task.best_return is None else ("carried out",)
+    metric = () if task.score == task.metric else (task.metric,)
     taken = ("largest drop", "steps to 0.9 of the best", "minutes to there", "minutes")
-    header = ("agent", "each seed", "mean", *carried_out, "IQM", "95 % interval", *taken)
+    header = ("agent", "each seed", "mean", *metric, "IQM", "95 % interval", *taken)
     left = ("agent", "each seed", "95 % interval")
     lines = [
-        f"{task.metric} after {int(every_run[0].args['total_timesteps']):,} steps\n",
+        f"{task.score} after {int(every_run[0].args['total_timesteps']):,} steps\n",
         f"| {' | '.join(header)} |",
         f"|{'|'.join('---' if name in left else '---:' for name in header)}|",
         *(row(agent, runs, task, best) for agent, runs in runs_of.items()),
@@ -483,14 +485,14 @@ def overview(tasks: dict[str, evaluate.Runs]) -> str:
     def cell(task: Task, runs: list[evaluate.RunLog]) -> str:
         if not runs:
             return ""
-        scores = evaluate.align([run.curves[f"eval/{task.metric}"] for run in runs])[1][-1]  # (R, M, E)
+        scores = last_scores(task.score, runs)
         few = f", {len(runs)} seed{'s' * (len(runs) > 1)}" if len(runs) < most else ""
         return f"{evaluate.iqm(scores):.2f} ({scores.mean():.2f}){few}"
 
-    lines = [f"| task, metric | {' | '.join(names)} |", f"|---|{'---:|' * len(names)}"]
+    lines = [f"| task, score | {' | '.join(names)} |", f"|---|{'---:|' * len(names)}"]
     for task, agents in tasks.items():
         cells = [cell(TASKS[task], agents.get(name, [])) for name in names]
-        lines.append(f"| {task}, {TASKS[task].metric} | {' | '.join(cells)} |")
+        lines.append(f"| {task}, {TASKS[task].score} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -543,7 +545,8 @@ def main(config: Config) -> None:
     for name, agents in tasks.items():
         if missing := [agent for agent, runs in agents.items() if not runs]:
             print(f"{name}: no results of {'; '.join(missing)}")
-    evaluate.draw_tasks({TASKS[name].title: agents for name, agents in found.items()}, str(config.out))
+    by_title = {TASKS[name].title: agents for name, agents in found.items()}
+    evaluate.draw_tasks(by_title, str(config.out), {TASKS[name].title: (TASKS[name].score,) for name in found})
 
 
 if __name__ == "__main__":

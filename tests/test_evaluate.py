@@ -478,7 +478,7 @@ def test_an_agent_has_one_look_in_all_tasks_and_one_place_in_the_legend(monkeypa
     run = evaluate.read_run(write_events("a", 1, [(1, 1), (1, 1)]))
     others = {f"task {i}": {f"agent {i}": [run]} for i in range(9)}
     tasks = {"first": {"lstm": [], "gru": [run, run]}, "second": {"trxl": [run], "gru": [run]}} | others
-    last = evaluate.draw_tasks(tasks, "curves")
+    last = evaluate.draw_tasks(tasks, "curves", dict.fromkeys(tasks, ("return",)))
     assert [*last["first"]] == ["gru"], "nothing to draw of the LSTM"
     figure = figures[0]
     first, second, *_, ninth = figure.axes

@@ -146,12 +146,14 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
         for one, other in zip(kept.curves[name], whole.curves[name], strict=True):
             assert one == pytest.approx(other, rel=1e-3)
     assert kept.curves["eval/return"][1].shape == (3, 2, 1)
+    carried_out = kept.curves["eval/carried_out"][1]
+    assert carried_out == pytest.approx(kept.curves["eval/return"][1] / 0.4), "of four commands, 0.1 each"
 
     shutil.rmtree(config.folder)
     learning.main(config)  # its result is enough
     told = capsys.readouterr().out
     assert "trained" not in told
-    score = kept.curves["eval/commands_completed"][1][-1].mean()
+    score = carried_out[-1].mean()
     assert f"\n| {agent} | {score:.2f} | {score:.2f} |" in told
     assert f"\nRuns: 1, together 0.0 hours without evaluations. Machines: {kept.machine}\n" in told
     assert config.out.with_suffix(".png").stat().st_size > 10_000
@@ -244,10 +246,10 @@ def test_agents_of_finite_mortar_mayhem_are_compared_by_what_they_carried_out():
     """Both complete all four commands by the metric from the first evaluation on, and carry out some of them."""
     task = learning.TASKS["mortar-mayhem"]
     slow, fast = (run_with(1, 1, 1, metric="eval/commands_completed") for _ in range(2))
-    for run, returns in ((slow, (0.1, 0.1, 0.3)), (fast, (0.1, 0.4, 0.4))):
-        run.curves["eval/return"] = run_with(*returns).curves["eval/coins_collected"]
+    for run, shares in ((slow, (0.25, 0.25, 0.75)), (fast, (0.25, 1, 1))):
+        run.curves["eval/carried_out"] = run_with(*shares).curves["eval/coins_collected"]
     table = learning.table(task, {"slow": [slow], "fast": [fast]}).splitlines()
-    assert "| slow | 1.00 | 1.00 | 0.75 | 1.00 | one seed | 0.00 | never |  | 3.0 |" in table
+    assert "| slow | 0.75 | 0.75 | 1.00 | 0.75 | one seed | 0.00 | never |  | 3.0 |" in table
     assert "| fast | 1.00 | 1.00 | 1.00 | 1.00 | one seed | 0.00 | 200 | 2.0 | 3.0 |" in table
 
 
@@ -272,7 +274,7 @@ def test_an_overview_says_where_seeds_or_agents_are_missing():
         "Endless-MortarMayhem-v0": {"GRU": [commands] * 2, "LSTM": []},
     }
     assert learning.overview(tasks).splitlines() == [
-        "| task, metric | GRU | LSTM |",
+        "| task, score | GRU | LSTM |",
         "|---|---:|---:|",
         "| SearingSpotlights-v0, success | 0.25 (0.25) | 0.25 (0.25), 1 seed |",
         "| Endless-MortarMayhem-v0, commands_completed | 2.00 (2.00), 2 seeds |  |",
