@@ -34,8 +34,8 @@ import learning
 from learning import TASKS, Task
 
 MORTAR_MAYHEM, MYSTERY_PATH = TASKS["mortar-mayhem"], TASKS["mystery-path"]
-FULL_MORTAR_MAYHEM, FULL_MYSTERY_PATH = TASKS["MortarMayhem-Grid-v0"], TASKS["MysteryPath-v0"]
-FULL_SPOTLIGHTS = TASKS["SearingSpotlights-v0"]
+FULL_MORTAR_MAYHEM, FREE_MORTAR_MAYHEM = TASKS["MortarMayhem-Grid-v0"], TASKS["MortarMayhem-v0"]
+FULL_MYSTERY_PATH, FULL_SPOTLIGHTS = TASKS["MysteryPath-v0"], TASKS["SearingSpotlights-v0"]
 ENDLESS = TASKS["endless-mortar-mayhem"]
 LONG_ENDLESS = replace(ENDLESS, total_timesteps=12_000_000)
 FULL_ENDLESS = TASKS["Endless-MortarMayhem-v0"]
@@ -106,6 +106,10 @@ CLAIMS = {
         FULL_MORTAR_MAYHEM,
         ("GRU", WIDE_TRXL), (*FEW_FRAMES, "stack of 16"),
     ),
+    "memory-free-mortar-mayhem": Claim(
+        "6.2.1", "the same in the full Mortar Mayhem with free movement", FREE_MORTAR_MAYHEM,
+        ("GRU", WIDE_TRXL), (*FEW_FRAMES, "stack of 16"),
+    ),
     "memory-commands-in-view": Claim(
         "6.2.1", "with all commands in view, knowing the time or some frames helps", COMMANDS_IN_VIEW,
         ("step encoding", "stack of 4", "stack of 16"), ("no memory",),
@@ -153,6 +157,10 @@ CLAIMS = {
         "6.2.2", "TrXL takes fewer samples than GRU in the full Mortar Mayhem Grid", FULL_MORTAR_MAYHEM,
         (WIDE_TRXL,), ("GRU",), area,
     ),
+    "score-free-mortar-mayhem": Claim(
+        "6.2.2", "TrXL completes more commands than GRU in Mortar Mayhem with free movement", FREE_MORTAR_MAYHEM,
+        (WIDE_TRXL,), ("GRU",),
+    ),
     "samples-full-mystery-path": Claim(
         "6.2.2", "TrXL takes fewer samples than GRU in the full Mystery Path", FULL_MYSTERY_PATH,
         (WIDE_TRXL,), ("GRU",), area,
@@ -177,6 +185,10 @@ CLAIMS = {
         "6.2.3", "LSTM completes fewer commands than GRU in the full Mortar Mayhem Grid", FULL_MORTAR_MAYHEM,
         ("GRU",), ("LSTM",),
     ),
+    "lstm-free-mortar-mayhem": Claim(
+        "6.2.3", "LSTM completes fewer commands than GRU in Mortar Mayhem with free movement", FREE_MORTAR_MAYHEM,
+        ("GRU",), ("LSTM",),
+    ),
     "lstm-full-mystery-path": Claim(
         "6.2.3", "LSTM takes more samples than GRU in the full Mystery Path", FULL_MYSTERY_PATH,
         ("GRU",), ("LSTM",), area,
@@ -187,6 +199,10 @@ CLAIMS = {
     ),
     "gates-full-mortar-mayhem": Claim(
         "6.2.3", "GTrXL completes fewer commands than TrXL in the full Mortar Mayhem Grid", FULL_MORTAR_MAYHEM,
+        (WIDE_TRXL,), (WIDE_GTRXL,),
+    ),
+    "gates-free-mortar-mayhem": Claim(
+        "6.2.3", "GTrXL completes fewer commands than TrXL in Mortar Mayhem with free movement", FREE_MORTAR_MAYHEM,
         (WIDE_TRXL,), (WIDE_GTRXL,),
     ),
     "gates-full-mystery-path": Claim(
