@@ -1472,11 +1472,7 @@ def state_of_process(run: Run) -> dict[str, Any]:
         "environments": save_state(run.envs),
         "next_obs": rollout.next_obs,
         "next_ground_truth": rollout.next_ground_truth,
-        "memory": {
-            name: part.cpu() if isinstance(part, Tensor) else part
-            for name, part in memory.items()
-            if name not in not_saved
-        },
+        "memory": {name: part for name, part in memory.items() if name not in not_saved},
         "torch": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state(rollout.values.device) if rollout.values.is_cuda else None,
         "numpy": np.random.get_state(),  # noqa: NPY002 (it and Python's: environments of other packages may use them)
