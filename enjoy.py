@@ -98,6 +98,7 @@ class Episode:
     estimate: list[np.ndarray] = field(default_factory=list)  # T x (G,); empty without an estimator
     attention: list[np.ndarray] = field(default_factory=list)  # T x (K, H, M or fewer), the oldest item first
     finished: bool = False  # not cut short
+    stacked: bool = False  # its images are stacks of grayscale ones
     final: dict[str, float] = field(default_factory=dict)  # numbers of the final info
 
     def film(self, name: str, frame: np.ndarray) -> None:
@@ -107,17 +108,19 @@ class Episode:
 
 # ---- PLAY ----
 @torch.no_grad()
-def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, max_steps: int) -> Episode:
+def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, max_steps: int, stacked: bool = False) -> Episode:
     """Play one episode, or max_steps of it, in the only lane of `envs`: fresh memory, stochastic policy.
+
+    stacked: whether the images that the agent gets are stacks of grayscale ones.
 
     Raises ValueError for an episode that the memory cannot hold.
     """
     torch.manual_seed(seed)
-    episode = Episode()
+    episode = Episode(stacked=stacked)
     obs, infos = envs.reset(seed=seed)
     memory = agent.memory.begin_rollout(agent.memory.initial_state(1, max_steps, torch.device("cpu")))
     while not episode.finished and len(episode.actions) < max_steps:
-        for name, frame in views(envs, obs).items():
+        for name, frame in views(envs, obs, stacked).items():
             episode.film(name, frame)
         if "ground_truth" in infos:
             episode.truth.append(infos["ground_truth"][0])
@@ -144,7 +147,7 @@ def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode)
     episode.values.append(values.item())
     episode.entropies.append(sum(branch.entropy().item() for branch in policy))
     if agent.decoder is not None:
-        episode.film(RECONSTRUCTION, displayable(agent.decoder(features).sigmoid()[0].numpy()))
+        episode.film(RECONSTRUCTION, displayable(agent.decoder(features).sigmoid()[0].numpy(), episode.stacked))
     if agent.estimator is not None:
         episode.estimate.append(agent.estimator(features)[0].numpy())
     return actions, after
@@ -172,9 +175,9 @@ def attention_weights(attention: ppo_trxl.Attention, x: Tensor, keys: Tensor, ag
     return (scores + bias).softmax(-1).masked_fill(sees_nothing[:, None], 0.0)
 
 
-def views(envs: gym.vector.VectorEnv, obs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def views(envs: gym.vector.VectorEnv, obs: dict[str, np.ndarray], stacked: bool) -> dict[str, np.ndarray]:
     """Return frames by name: what the agent sees (drawn for it, if it gets vectors only) and the ground truth."""
-    pictures = {name: displayable(part[0]) for name, part in obs.items() if part.ndim == 4}
+    pictures = {name: displayable(part[0], stacked) for name, part in obs.items() if part.ndim == 4}
     frames = {VIEW if len(pictures) == 1 else name: picture for name, picture in pictures.items()}
     if not frames:
         frames["rendered frame"] = rendered(envs, "rgb_array")
@@ -194,12 +197,12 @@ def rendered(envs: gym.vector.VectorEnv, mode: str) -> np.ndarray:
     return np.asarray(image)
 
 
-def displayable(pixels: np.ndarray) -> np.ndarray:
-    """Turn pixels (H, W, C), uint8 or floats in [0, 1], into a frame: a stack of pictures becomes a square of them."""
+def displayable(pixels: np.ndarray, stacked: bool) -> np.ndarray:
+    """Turn pixels (H, W, C), uint8 or floats in [0, 1], into a frame: a stack becomes a square of C pictures."""
     if pixels.dtype != np.uint8:
         pixels = (pixels.clip(0, 1) * 255).round().astype(np.uint8)
     height, width, channels = pixels.shape
-    if channels == 3:
+    if channels == 3 and not stacked:
         return pixels
     side = math.ceil(math.sqrt(channels))
     frames = np.zeros((side * side, height, width), np.uint8)
@@ -300,7 +303,7 @@ def main(config: Config) -> str:
         raise OSError(f"--out is {out}, but there is no folder {out.parent}")
     agent, envs, args = load(config.checkpoint)
     seed = args.start_level + args.num_levels if config.seed is None else config.seed
-    episode = play(agent, envs, seed, config.max_steps)
+    episode = play(agent, envs, seed, config.max_steps, stacked=args.frame_stack > 0)
     facts = summary(episode, args, seed)
     out.write_text(page(page_data(episode, args.env_id, facts), get_plotlyjs()), encoding="utf-8")
     size = out.stat().st_size / 1e6

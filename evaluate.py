@@ -66,19 +66,9 @@ OWN_METRIC = {
     "Endless-SearingSpotlights": "coins_collected",
 }
 # Arguments that say how a run was started and recorded, not what learned.
-BOOKKEEPING = {"seed", "torch_deterministic", "cuda", "track", "wandb_project_name", "wandb_entity", "capture_video"}
-BOOKKEEPING |= {
-    "save_model",
-    "eval_interval",
-    "eval_levels",
-    "eval_repeats",
-    "eval_max_steps",
-    "compile",  # of runs before it was removed
-    "preset",
-    "resume",
-    "checkpoint_interval",
-    "keep_models",
-}
+BOOKKEEPING = {"preset", "seed", "torch_deterministic", "cuda", "track", "wandb_project_name", "wandb_entity"}
+BOOKKEEPING |= {"capture_video", "save_model", "resume", "checkpoint_interval", "keep_models"}
+BOOKKEEPING |= {"eval_interval", "eval_levels", "eval_repeats", "eval_max_steps"}
 RESAMPLES = 2000
 LABEL_WIDTH = 48  # characters of a line in a legend; a longer one would leave no room for the curves
 POINTS = 200  # of a curve; one that has more is averaged over neighbours
@@ -141,11 +131,17 @@ def interval(scores: np.ndarray) -> np.ndarray | None:
     if seeds < 2:
         return None
     drawn = np.random.default_rng(0).integers(seeds, size=(RESAMPLES, seeds))  # (B, R)
-    return np.percentile(iqm(scores[..., drawn, :, :]), [2.5, 97.5], axis=-1)  # of (..., B, R, M, E)
+    # Resamples of the same seeds are scored once, and one after the other: all at once would take much memory.
+    different, which = np.unique(np.sort(drawn), axis=0, return_inverse=True)  # (U, R), (B,)
+    iqms = np.stack([iqm(scores[..., each, :, :]) for each in different], axis=-1)  # (..., U)
+    return np.percentile(iqms[..., which.ravel()], [2.5, 97.5], axis=-1)  # of (..., B)
 
 
-def summary(agent: str, paths: list[str], scores: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Return what to report of an agent, for JSON: scores (R, M, E) by metric, paths in the order of the seeds."""
+def summary(agent: str, runs: dict[str, int | None], scores: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Return what to report of an agent, for JSON: scores (R, M, E) by metric.
+
+    runs: the paths in the order of the seeds, with the steps that each was trained for, None where that is not known.
+    """
     metrics = {}
     for name, values in scores.items():
         metrics[name] = {"mean": float(values.mean())}
@@ -154,11 +150,14 @@ def summary(agent: str, paths: list[str], scores: dict[str, np.ndarray]) -> dict
             metrics[name][f"iqm{suffix}"] = float(iqm(each))
             metrics[name][f"interval{suffix}"] = None if ends is None else ends.tolist()
         metrics[name]["scores"] = values.tolist()
-    return {"agent": agent, "runs": paths, "metrics": metrics}
+    return {"agent": agent, "runs": [*runs], "steps": [*runs.values()], "metrics": metrics}
 
 
 def table(agents: list[dict[str, Any]]) -> str:
-    """Return the summaries as a Markdown table, the agents below each other for every metric."""
+    """Return the summaries as a Markdown table, the agents below each other for every metric.
+
+    Below it is a line for each agent whose seeds were trained for different numbers of steps.
+    """
     lines = [
         "| metric | agent | seeds | mean | IQM | 95 % interval | IQM of level means | 95 % interval |",
         "|---|---|---:|---:|---:|---|---:|---|",
@@ -172,6 +171,10 @@ def table(agents: list[dict[str, Any]]) -> str:
                 cells += [f"{score[f'iqm{suffix}']:.3f}"]
                 cells += ["none: one seed" if ends is None else "{:.3f} to {:.3f}".format(*ends)]
             lines.append(f"| {' | '.join(map(str, cells))} |")
+    for agent in agents:
+        if len({*agent["steps"]}) > 1:
+            steps = ", ".join("an unknown number" if step is None else f"{step:,}" for step in agent["steps"])
+            lines.append(f"\n{agent['agent']}: its seeds were trained for different numbers of steps: {steps}")
     return "\n".join(lines)
 
 
@@ -274,6 +277,11 @@ class RunLog:
         """Return the hours (P,) that it had been training for at these steps (P,), interpolated within iterations."""
         ends = self.curves[SECONDS["iteration"]][0]
         return np.interp(steps, [0, *ends], [0, *np.cumsum(self.seconds("iteration")) / 3600])
+
+    @property
+    def last_step(self) -> int:
+        """The last step that a curve has a point at."""
+        return int(max(steps[-1] for steps, _ in self.curves.values()))
 
     def has_seconds(self) -> bool:
         """Return whether it has the seconds of its iterations, which runs of earlier versions do not have."""
@@ -435,8 +443,7 @@ def draw_metric(
         marker = "o" if len(x) == 1 else None  # a line of one point is not to be seen
         axis.plot(x, iqm(scores), marker=marker, **styles[label])
         if len(runs) > 1:
-            band = np.stack([interval(point) for point in scores], axis=-1)  # (2, P); one after the other saves memory
-            axis.fill_between(x, *band, color=styles[label]["color"], alpha=0.2, linewidth=0)
+            axis.fill_between(x, *interval(scores), color=styles[label]["color"], alpha=0.2, linewidth=0)
         last[label] = scores[-1]
     axis.set(xlabel="steps" if over == "steps" else "hours of training", ylabel=name)
     # 2 M steps are 2,000,000, but 20 m hours would be 0.02.
@@ -564,12 +571,17 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
         title: {label: [runs_by_path[path] for path in members] for label, members in agents.items()}
         for title, agents in paths.items()
     }
-    env_ids = {title: runs_by_path[next(iter(agents.values()))[0]].args["env_id"] for title, agents in paths.items()}
-    metrics = {title: config.metrics or (own_metric(env_id),) for title, env_id in env_ids.items()}
+    metrics = {}
+    for title, agents in tasks.items():
+        first, *_ = itertools.chain(*agents.values())
+        metrics[title] = config.metrics or (own_metric(first.args["env_id"]),)
     last = draw_tasks(tasks, config.out, metrics, config.over)
     report = []
     for title, agents in tasks.items():
-        summaries = [summary(label, paths[title][label], last[title][label]) for label in agents]
+        summaries = [
+            summary(label, {run.path: run.last_step for run in runs}, last[title][label])
+            for label, runs in agents.items()
+        ]
         for each in summaries:
             if all(run.has_seconds() for run in agents[each["agent"]]):
                 each["wall_time"] = wall_time(agents[each["agent"]])
@@ -676,7 +688,7 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
         summaries = []
         for label, members in agents.items():
             scores = {name: np.stack([played[path][name] for path in members]) for name in metrics}  # (R, M, E) each
-            summaries.append(summary(label, members, scores))
+            summaries.append(summary(label, {path: checkpoints[path].step for path in members}, scores))
         finished = float(np.mean([played[path]["finished"] for path in paths]))
         report.append({"task": title, "finished": finished, "agents": summaries})
         print(f"{title}\n\n{table(summaries)}\n")
@@ -692,8 +704,8 @@ def check_numbers(config: Config) -> None:
     for name, low in (("levels", 1), ("repeats", 1), ("max_steps", 1), ("seed", 0)):
         if not low <= getattr(config, name) < 2**63:
             raise ValueError(f"{ppo_gru.flag(name)} is {getattr(config, name)}; it must be from {low} to 2 ** 63 - 1")
-    if config.levels * config.repeats > MOST_EPISODES:
-        raise ValueError(f"--levels x --repeats is {config.levels * config.repeats}; at most {MOST_EPISODES} fit")
+    if (episodes := config.levels * config.repeats) > MOST_EPISODES:
+        raise ValueError(f"--levels x --repeats is {episodes}; at most {MOST_EPISODES} are played")
 
 
 def main(config: Config) -> None:

@@ -310,7 +310,7 @@ def result_of(config: Training, plan: Plan) -> evaluate.RunLog | None:
 def is_complete(run: evaluate.RunLog) -> bool:
     """Return whether a run has trained for all its steps."""
     total, *batch = (int(run.args[name]) for name in ("total_timesteps", "num_envs", "num_steps"))
-    return run.has_seconds() and run.curves["charts/seconds_iteration"][0][-1] + math.prod(batch) > total
+    return run.has_seconds() and run.last_step + math.prod(batch) > total
 
 
 RUNNING = set()  # training processes, to be stopped with this one
@@ -368,7 +368,7 @@ def write_result(config: Training, plan: Plan) -> None:
         raise SystemExit(f"{plan}, was stopped; the same command goes on with it")
     metric = plan.task.metric
     steps, _ = run.curves.get(f"eval/{metric}", ([0], None))
-    if steps[-1] != run.curves["charts/seconds_iteration"][0][-1]:
+    if steps[-1] != run.last_step:
         raise SystemExit(
             f"{plan}, has no {metric} at its end: an evaluation was cut short; give the agent more steps, as "
             f'"{plan.agent} --eval-max-steps 100000"'
@@ -543,8 +543,9 @@ def main(config: Config) -> None:
     for name, agents in found.items():
         print(f"## {TASKS[name].title}\n\n{table(TASKS[name], agents)}\n")
     for name, agents in tasks.items():
-        if missing := [agent for agent, runs in agents.items() if not runs]:
-            print(f"{name}: no results of {'; '.join(missing)}")
+        lacking = {agent: len(config.seeds) - len(runs) for agent, runs in agents.items()}
+        if missing := [f"{count} of {agent}" for agent, count in lacking.items() if count]:
+            print(f"{name}: runs without a result: {'; '.join(missing)}")
     by_title = {TASKS[name].title: agents for name, agents in found.items()}
     evaluate.draw_tasks(by_title, str(config.out), {TASKS[name].title: (TASKS[name].score,) for name in found})
 

@@ -282,7 +282,7 @@ def iteration(script: ModuleType, args: Any, run: Any, step: int, metric: str) -
     )
     rollout.returns = rollout.advantages + rollout.values
     script.update(run.agent, run.optimizer, rollout, ent_coef, args)
-    return episodes.get(f"episode/{metric}", [])
+    return episodes.get("charts/episodic_return" if metric == "return" else f"episode/{metric}", [])
 
 
 def run_trial(trial: optuna.Trial, config: Config) -> float | None:

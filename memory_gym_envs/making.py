@@ -151,9 +151,10 @@ def load_state(envs: VectorEnv, state: dict[str, Any]) -> None:
     parts = saved_parts(envs)
     if parts is None:
         raise ValueError(f"{envs.spec.id} has parts of other packages, whose state cannot be set")
-    if not isinstance(state, dict) or state.keys() != {"environments", "parts"}:
+    theirs = state.get("environments") if isinstance(state, dict) else None
+    if not isinstance(theirs, dict) or state.keys() != {"environments", "parts"}:
         raise ValueError(f"this is no state of environments: {brief(state)}")
-    ours, theirs = describe(parts), state["environments"]
+    ours = describe(parts)
     for name in ours | theirs:
         if ours.get(name) != theirs.get(name):
             raise ValueError(

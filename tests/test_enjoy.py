@@ -163,10 +163,12 @@ def test_attention_is_packed_by_age():
 
 def test_displayable():
     stack = np.arange(5, dtype=np.uint8) * np.ones((2, 3, 1), np.uint8)
-    shown = enjoy.displayable(stack)
+    shown = enjoy.displayable(stack, stacked=True)
     assert shown.shape == (6, 9)  # three by three, the last four of them black
     assert shown[::2, ::3].tolist() == [[0, 1, 2], [3, 4, 0], [0, 0, 0]]
-    assert enjoy.displayable(np.array([[[0.0, 0.5, 1.0]]])).tolist() == [[[0, 128, 255]]]
+    colours = np.array([[[0.0, 0.5, 1.0]]])
+    assert enjoy.displayable(colours, stacked=False).tolist() == [[[0, 128, 255]]]
+    assert enjoy.displayable(colours, stacked=True).tolist() == [[0, 128], [255, 0]]
 
 
 def test_text_in_the_data_cannot_end_the_script():

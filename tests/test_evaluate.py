@@ -72,7 +72,7 @@ def test_interval_for_every_point_of_a_curve():
 
 def test_one_seed_has_no_interval():
     assert evaluate.interval(np.zeros((1, 50, 3))) is None
-    summary = evaluate.summary("gru", ["a"], {"return": np.array([[[0.0, 2.0], [2.0, 2.0]]])})
+    summary = evaluate.summary("gru", {"a": 64}, {"return": np.array([[[0.0, 2.0], [2.0, 2.0]]])})
     assert summary["metrics"]["return"]["interval"] is None
     told = "| return | gru | 1 | 1.500 | 2.000 | none: one seed | 1.500 | none: one seed |"
     assert evaluate.table([summary]).splitlines()[-1] == told
@@ -81,10 +81,26 @@ def test_one_seed_has_no_interval():
 def test_iqm_of_episodes_and_of_level_means():
     """Ten levels, ten episodes each, seven of them won: 0.9 of the middle half, and each level's mean is 0.7."""
     won = np.tile([1.0] * 7 + [0.0] * 3, (2, 10, 1))
-    told = evaluate.summary("gru", ["a", "b"], {"success": won})["metrics"]["success"]
+    told = evaluate.summary("gru", {"a": 64, "b": 64}, {"success": won})["metrics"]["success"]
     assert (told["mean"], told["iqm"], told["iqm_of_levels"]) == pytest.approx((0.7, 0.9, 0.7))
     assert told["interval"] == pytest.approx([0.9, 0.9])
     assert told["interval_of_levels"] == pytest.approx([0.7, 0.7])
+
+
+def test_seeds_at_different_steps_are_named():
+    scores = {"return": np.zeros((3, 1, 1))}
+    same, other = (
+        evaluate.summary("gru", dict.fromkeys("abc", 64) | more, scores) for more in ({}, {"b": 32, "c": None})
+    )
+    assert "steps" not in evaluate.table([same])
+    told = "gru: its seeds were trained for different numbers of steps: 64, 32, an unknown number"
+    assert evaluate.table([same, other]).splitlines()[-1] == told
+
+
+def test_the_interval_is_that_of_all_resamples():
+    scores = np.random.default_rng(3).random((4, 10, 3))
+    drawn = np.random.default_rng(0).integers(4, size=(evaluate.RESAMPLES, 4))
+    assert evaluate.interval(scores) == pytest.approx(np.percentile(evaluate.iqm(scores[drawn]), [2.5, 97.5]))
 
 
 # ---- agents ----
@@ -593,7 +609,7 @@ BAD = {
     "nowhere.pt": "there is no file nowhere.pt",
     "notes.txt": "notes.txt is cut short, or neither a model nor a checkpoint",
     "MODEL --levels 0": r"--levels is 0; it must be from 1 to 2 \*\* 63 - 1",
-    "MODEL --levels 1000000000": "--levels x --repeats is 3000000000; at most 100000 fit",
+    "MODEL --levels 1000000000": "--levels x --repeats is 3000000000; at most 100000 are played",
     "MODEL --seed 99999999999999999999": r"--seed is 99999999999999999999; it must be from 0 to 2 \*\* 63 - 1",
     "cut.pt": "cut.pt is cut short, or neither a model nor a checkpoint",
     "MODEL --max-steps 0": "--max-steps is 0",

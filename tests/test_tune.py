@@ -145,7 +145,8 @@ def test_iterations_train_as_the_script_does(script, tiny):
     script.close(run)
     own = tune.start(script, args)
     for step in range(0, 192, 64):
-        tune.iteration(script, args, own, step, "success")
+        returns = tune.iteration(script, args, own, step, "return")
+        assert returns  # of the episodes that ended
     script.close(own)
     pairs = zip(run.agent.parameters(), own.agent.parameters(), strict=True)
     assert all(theirs.equal(ours) for theirs, ours in pairs)

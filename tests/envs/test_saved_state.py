@@ -321,7 +321,7 @@ def test_a_spoiled_state_changes_nothing(part, spoil):
 def test_what_is_no_state():
     envs = make_envs("MysteryPath-v0", 2)
     envs.reset(seed=0)
-    for wrong in (None, {}, {"environments": {}}, "state"):
+    for wrong in (None, {}, {"environments": {}}, {"environments": None, "parts": []}, "state"):
         with pytest.raises(ValueError, match="this is no state of environments: "):
             load_state(envs, wrong)
     for attempt in (save_state, lambda env: load_state(env, save_state(envs))):
