@@ -36,6 +36,7 @@ from learning import TASKS, Task
 MORTAR_MAYHEM, MYSTERY_PATH = TASKS["mortar-mayhem"], TASKS["mystery-path"]
 FULL_MORTAR_MAYHEM, FREE_MORTAR_MAYHEM = TASKS["MortarMayhem-Grid-v0"], TASKS["MortarMayhem-v0"]
 FULL_MYSTERY_PATH, FULL_SPOTLIGHTS = TASKS["MysteryPath-v0"], TASKS["SearingSpotlights-v0"]
+FULL_MYSTERY_PATH_GRID = TASKS["MysteryPath-Grid-v0"]
 ENDLESS = TASKS["endless-mortar-mayhem"]
 LONG_ENDLESS = replace(ENDLESS, total_timesteps=12_000_000)
 FULL_ENDLESS = TASKS["Endless-MortarMayhem-v0"]
@@ -124,6 +125,10 @@ CLAIMS = {
     ),
     "memory-full-mystery-path": Claim(
         "6.2.1", "agents with a memory succeed more often than all others in the full Mystery Path", FULL_MYSTERY_PATH,
+        ("GRU", WIDE_TRXL), (*FEW_FRAMES, "stack of 16"),
+    ),
+    "memory-full-mystery-path-grid": Claim(
+        "6.2.1", "the same in the full Mystery Path Grid", FULL_MYSTERY_PATH_GRID,
         ("GRU", WIDE_TRXL), (*FEW_FRAMES, "stack of 16"),
     ),
     "stack-goal-in-view": Claim(
