@@ -132,7 +132,7 @@ def interval(scores: np.ndarray) -> np.ndarray | None:
         return None
     drawn = np.random.default_rng(0).integers(seeds, size=(RESAMPLES, seeds))  # (B, R)
     # Resamples of the same seeds are scored once, and one after the other: all at once would take much memory.
-    different, which = np.unique(np.sort(drawn), axis=0, return_inverse=True)  # (U, R), (B,)
+    different, which = np.unique(np.sort(drawn), axis=0, return_inverse=True)  # (U, R), (B,); in NumPy 2.0 (B, 1)
     iqms = np.stack([iqm(scores[..., each, :, :]) for each in different], axis=-1)  # (..., U)
     return np.percentile(iqms[..., which.ravel()], [2.5, 97.5], axis=-1)  # of (..., B)
 
