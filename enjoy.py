@@ -24,17 +24,15 @@ import torch
 import tyro
 from torch import Tensor, nn
 
-import ppo_gru
-import ppo_trxl
-from memory_gym_envs.making import check_draws, final_numbers, is_memory_gym
+from ppo_utils.checkpoints import import_script, load_weights, make_agent, read_model, saved_args
+from ppo_utils.environments import as_tensors, envs_for, final_numbers, is_memory_gym
+from ppo_utils.video import check_draws
 
 try:
     from PIL import Image
     from plotly.offline import get_plotlyjs
 except ImportError as error:
     raise SystemExit(f'enjoy.py needs {error.name}: pip install -e ".[eval]"') from None
-
-from evaluate import script_of
 
 SHEET = 16  # frames in one picture: a neighbour costs few bytes, and a jump makes a browser decode one sheet only
 VIEW, RECONSTRUCTION = "agent's view", "reconstruction"
@@ -113,18 +111,17 @@ def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, max_steps: int
 
     stacked: whether the images that the agent gets are stacks of grayscale ones.
 
-    Raises ValueError for an episode that the memory cannot hold.
     """
     torch.manual_seed(seed)
     episode = Episode(stacked=stacked)
     obs, infos = envs.reset(seed=seed)
-    memory = agent.memory.begin_rollout(agent.memory.initial_state(1, max_steps, torch.device("cpu")))
+    memory = agent.memory.initial_state(1, max_steps, torch.device("cpu"))
     while not episode.finished and len(episode.actions) < max_steps:
         for name, frame in views(envs, obs, stacked).items():
             episode.film(name, frame)
         if "ground_truth" in infos:
             episode.truth.append(infos["ground_truth"][0])
-        actions, memory = act(agent, ppo_gru.as_tensors(obs, torch.device("cpu")), memory, episode)
+        actions = act(agent, as_tensors(obs, torch.device("cpu")), memory, episode)
         obs, rewards, terminated, truncated, infos = envs.step(actions.numpy())
         episode.rewards.append(float(rewards[0]))
         episode.finished = bool(terminated[0] or truncated[0])
@@ -133,12 +130,13 @@ def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, max_steps: int
     return episode
 
 
-def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode) -> tuple[Tensor, Any]:
-    """Return actions (1, A) and memory, as `Agent.get_action_and_value` does; add what was computed to the episode."""
+def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode) -> Tensor:
+    """Return actions (1, A), as `Agent.get_action_and_value` does; add what was computed to the episode."""
     x = agent.encoder(obs)
-    y, after = agent.memory.step(x, memory)  # raises MemoryLimit; what it stores, this step's attention does not see
-    if isinstance(agent.memory, ppo_trxl.Memory):
-        episode.attention.append(attention_of(agent.memory, x, memory)[0].numpy())
+    y, stored = agent.memory.step(memory, x)
+    if hasattr(agent.memory, "attended_rows"):  # a transformer
+        episode.attention.append(attention_of(agent.memory, memory, x)[0].numpy())
+    agent.memory.store(memory, stored)
     logits, values, features = agent.heads(y)
     policy = agent.heads.distributions(logits)
     actions = torch.stack([branch.sample() for branch in policy], -1)
@@ -150,29 +148,31 @@ def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode)
         episode.film(RECONSTRUCTION, displayable(agent.decoder(features).sigmoid()[0].numpy(), episode.stacked))
     if agent.estimator is not None:
         episode.estimate.append(agent.estimator(features)[0].numpy())
-    return actions, after
+    return actions
 
 
-def attention_of(memory: ppo_trxl.Memory, x: Tensor, state: ppo_trxl.MemoryState) -> Tensor:
-    """Return what the next step, x (N, D), attends to: weights (N, K, H, M) of the last M steps, the oldest first."""
-    rows, age, seen = memory.look_back(state)
+def attention_of(memory: nn.Module, state: Any, x: Tensor) -> Tensor:
+    """Return what the next step, x (N, D), attends to: weights (N, K, H, M) of the last M steps, the oldest first.
+
+    memory, state: a transformer's Memory and MemoryState, as in ppo_trxl.py.
+    """
+    rows, age, mask = memory.attended_rows(state)
     x, found = x[:, None], []  # (N, 1, D)
-    added_to_query = memory.added_to_query(state.episode_step[:, None], state.items[state.now - 1][:, None], x.dtype)
+    query = memory.first_query(x, state.episode_step[:, None], state.hidden[state.now - 1, :, -1:])
     for k, block in enumerate(memory.blocks):
-        added = added_to_query if k == 0 else 0.0
         keys_values = state.keys[k][:, rows], state.values[k][:, rows]
-        query = block.norm_query(x + added)
-        found.append(attention_weights(block.attention, query, keys_values[0], age, seen)[:, :, 0])
-        x = block(x, added, keys_values, age, seen)
+        found.append(attention_weights(block.attention, block.norm_query(query), keys_values[0], age, mask)[:, :, 0])
+        x = query = block(x, query, keys_values, age, mask)
     return torch.stack(found, 1)
 
 
-def attention_weights(attention: ppo_trxl.Attention, x: Tensor, keys: Tensor, age: Tensor, seen: Tensor) -> Tensor:
-    """Return the weights (S, H, L, M) that `Attention.forward` gives to the items; its fused kernel does not."""
-    query, mask, sees_nothing = attention.query_and_mask(x, age, seen)
-    bias = torch.zeros_like(mask, dtype=x.dtype).masked_fill(~mask, -math.inf) if mask.dtype == torch.bool else mask
+def attention_weights(attention: nn.Module, x: Tensor, keys: Tensor, age: Tensor, mask: Tensor) -> Tensor:
+    """Return the weights (S, H, L, M) that `Attention.forward` gives to the keys; its fused kernel does not."""
+    query, bias, empty = attention.query_and_bias(x, age, mask)
+    if bias.dtype == torch.bool:
+        bias = torch.zeros_like(bias, dtype=x.dtype).masked_fill(~bias, -math.inf)
     scores = query @ attention.split(keys).transpose(2, 3) / math.sqrt(query.shape[-1])
-    return (scores + bias).softmax(-1).masked_fill(sees_nothing[:, None], 0.0)
+    return (scores + bias).softmax(-1).masked_fill(empty[:, None], 0.0)
 
 
 def views(envs: gym.vector.VectorEnv, obs: dict[str, np.ndarray], stacked: bool) -> dict[str, np.ndarray]:
@@ -281,14 +281,14 @@ def load(path: str) -> tuple[nn.Module, gym.vector.VectorEnv, Any]:
 
     Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
     """
-    saved = ppo_gru.read_model(path)
-    script = script_of(saved, path)
-    args = replace(script.saved_args(saved), amp=False)  # one lane is little work; not every processor has bfloat16
+    saved = read_model(path)
+    script = import_script(saved, path)
+    args = replace(saved_args(script.Args, saved), amp=False)  # one lane is little work; not all CPUs have bfloat16
     check_draws("enjoy.py", args.env_id)
-    envs = script.environments(args, 1, render_mode="debug_rgb_array")
+    envs = envs_for(args, 1, render_mode="debug_rgb_array")
     _, infos = envs.reset()
-    agent = script.make_agent(envs, infos, args, torch.device("cpu"))
-    script.load_weights(agent, saved, path)
+    agent = make_agent(script.Agent, envs, infos, args)
+    load_weights(agent, saved, path)
     return agent, envs, args
 
 

@@ -1,7 +1,7 @@
 """Score trained agents on levels that they have never seen, or draw their sample-efficiency curves.
 
     python evaluate.py runs/*/model.pt --json scores.json
-    python evaluate.py runs/X/model-*.pt
+    python evaluate.py runs/X/checkpoint-*.pt
     python evaluate.py --curves runs/* --out docs/curves
     python evaluate.py --curves runs/* --over time
 
@@ -29,7 +29,7 @@ import textwrap
 import zlib
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
@@ -42,8 +42,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.util.tensor_util import make_ndarray
 from tqdm import tqdm
 
-import ppo_gru
-import ppo_trxl
+from ppo_utils.checkpoints import import_script, load_weights, make_agent, read_model, saved_args
+from ppo_utils.environments import envs_for
+from ppo_utils.evaluation import evaluate, evaluation_levels
+from ppo_utils.flags import flag
 
 try:
     from matplotlib import color_sequences
@@ -56,7 +58,6 @@ except ImportError as error:
     raise SystemExit(f'evaluate.py needs {error.name}: pip install -e ".[eval]"') from None
 
 MOST_EPISODES = 100_000  # played at once
-SCRIPTS = {"ppo_gru": ppo_gru, "ppo_trxl": ppo_trxl}
 # A family's own metric (6.1.3), by the beginning of the id; any other environment's is the return.
 OWN_METRIC = {
     "MortarMayhem": "commands_completed",
@@ -66,9 +67,8 @@ OWN_METRIC = {
     "Endless-SearingSpotlights": "coins_collected",
 }
 # Arguments that say how a run was started and recorded, not what learned.
-BOOKKEEPING = {"preset", "seed", "torch_deterministic", "cuda", "track", "wandb_project_name", "wandb_entity"}
-BOOKKEEPING |= {"capture_video", "save_model", "resume", "checkpoint_interval", "keep_models"}
-BOOKKEEPING |= {"eval_interval", "eval_levels", "eval_repeats", "eval_max_steps"}
+BOOKKEEPING = {"preset", "seed", "torch_deterministic", "cuda", "track", "capture_video", "save_model", "resume"}
+BOOKKEEPING |= {"checkpoint_interval", "eval_interval", "eval_levels", "eval_max_steps"}
 RESAMPLES = 2000
 LABEL_WIDTH = 48  # characters of a line in a legend; a longer one would leave no room for the curves
 POINTS = 200  # of a curve; one that has more is averaged over neighbours
@@ -361,7 +361,10 @@ def with_defaults(given: dict[str, str]) -> dict[str, str]:
     if given.get("norm_adv") in ("True", "False"):  # before it was a choice
         given = given | {"norm_adv": "minibatch" if given["norm_adv"] == "True" else "none"}
     name = given.get("script", "ppo_trxl" if "trxl_dim" in given else "ppo_gru")  # an older run does not say it
-    defaults = asdict(SCRIPTS[name].Args()) if name in SCRIPTS else given
+    try:
+        defaults = asdict(import_script({"script": name}, name).Args())
+    except ValueError:  # the script is not here
+        defaults = given
     return {"script": name} | {key: given.get(key, str(value)) for key, value in defaults.items()}
 
 
@@ -512,7 +515,7 @@ def draw_tasks(
 
 def lacks_episodes(run: RunLog, name: str) -> bool:
     """Return whether a run has been evaluated several times on each level, but kept the levels' means only."""
-    return name.startswith("eval/") and run.args["eval_repeats"] != "1" and run.curves[name][1].shape[2] == 1
+    return name.startswith("eval/") and run.curves[name][1].shape[2] == 1
 
 
 def wall_time(runs: list[RunLog]) -> dict[str, float]:
@@ -596,33 +599,24 @@ def draw_curves(config: Config) -> list[dict[str, Any]]:
 
 
 # ---- SCORES ----
-def script_of(saved: dict[str, Any], path: str) -> ModuleType:
-    """Return the script that wrote the checkpoint in a file; raise ValueError if it is not among `SCRIPTS`."""
-    if saved["script"] not in SCRIPTS:
-        raise ValueError(f"{path} was trained by {saved['script']}.py, which is not among SCRIPTS in evaluate.py")
-    return SCRIPTS[saved["script"]]
-
-
 @dataclass
 class Checkpoint:
     """What a model file holds, read once."""
 
     path: str
     script: ModuleType  # that trained it
-    saved: dict[str, Any]  # what the script's saved_args and load_weights need
+    saved: dict[str, Any]  # script, args and weights
     step: int | None  # of the training, at which it was written; None if the file does not tell
-    args: Any  # the script's Args, with this evaluation's settings
+    args: Any  # the script's Args
 
     @classmethod
-    def read(cls, path: str, config: Config) -> "Checkpoint":
-        """Read a file; raise ValueError if it is no checkpoint, OSError if it cannot be read."""
-        saved = ppo_gru.read_model(path)
-        script = script_of(saved, path)
-        settings = {"eval_levels": config.levels, "eval_repeats": config.repeats, "eval_max_steps": config.max_steps}
-        args = replace(script.saved_args(saved), cuda=config.cuda, **settings)
+    def read(cls, path: str) -> "Checkpoint":
+        """Read a file; raise ValueError if it is no checkpoint or its script is not here, OSError without a file."""
+        saved = read_model(path)
+        script = import_script(saved, path)
         # A file to resume from holds much more, which would stay in memory.
         needed = {name: saved[name] for name in ("script", "args", "weights")}
-        return cls(path, script, needed, saved.get("step"), args)
+        return cls(path, script, needed, saved.get("step"), saved_args(script.Args, saved))
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments by name, with the script's name, and the step if it is known."""
@@ -630,27 +624,28 @@ class Checkpoint:
         return {"script": self.script.__name__, **asdict(self.args), **step}
 
 
-def play(checkpoint: Checkpoint, seed: int) -> dict[str, np.ndarray]:
+def play(checkpoint: Checkpoint, config: Config) -> dict[str, np.ndarray]:
     """Let a checkpoint's agent play the levels; return numbers (M, E) by name.
 
-    Raises what the script raises for an environment that is not there or weights that do not fit.
+    Raises what `make_envs` raises for an environment that is not there, ValueError for weights that do not fit.
     """
-    script, args = checkpoint.script, checkpoint.args
-    device = torch.device("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
-    envs = script.environments(args, args.eval_levels * args.eval_repeats)
+    args = checkpoint.args
+    device = torch.device("cuda" if torch.cuda.is_available() and config.cuda else "cpu")
+    levels = evaluation_levels(args, config.levels, config.repeats)
+    envs = envs_for(args, len(levels))
     _, infos = envs.reset()
-    agent = script.make_agent(envs, infos, args, device)
-    script.load_weights(agent, checkpoint.saved, checkpoint.path)
-    torch.manual_seed(seed)
-    found = script.evaluate(agent, envs, args)
+    agent = make_agent(checkpoint.script.Agent, envs, infos, args).to(device)
+    load_weights(agent, checkpoint.saved, checkpoint.path)
+    torch.manual_seed(config.seed)
+    found = evaluate(agent, envs, levels, config.max_steps, args.amp)
     envs.close()
-    return {name: numbers.reshape(args.eval_levels, args.eval_repeats) for name, numbers in found.items()}
+    return {name: numbers.reshape(config.levels, config.repeats) for name, numbers in found.items()}
 
 
-def title_of(args: dict[str, Any]) -> str:
+def title_of(args: dict[str, Any], config: Config) -> str:
     """Name the task and the levels of it that are played."""
     first = args["start_level"] + args["num_levels"]
-    return f"{task_of(args)}, levels {first} to {first + args['eval_levels'] - 1}, {args['eval_repeats']} times each"
+    return f"{task_of(args)}, levels {first} to {first + config.levels - 1}, {config.repeats} times each"
 
 
 def choose_metrics(wanted: tuple[str, ...], env_id: str, played: list[dict[str, np.ndarray]]) -> list[str]:
@@ -671,10 +666,10 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
 
     A task that does not report the wanted metrics gets a line instead. Raises ValueError if none does.
     """
-    checkpoints = {path: Checkpoint.read(path, config) for path in dict.fromkeys(config.checkpoints)}
+    checkpoints = {path: Checkpoint.read(path) for path in dict.fromkeys(config.checkpoints)}
     arguments = {path: checkpoint.arguments() for path, checkpoint in checkpoints.items()}
-    tasks = tasks_of(arguments, title_of)
-    played = {path: play(each, config.seed) for path, each in tqdm(checkpoints.items(), unit=" agents")}
+    tasks = tasks_of(arguments, lambda args: title_of(args, config))
+    played = {path: play(each, config) for path, each in tqdm(checkpoints.items(), unit=" agents")}
     report = []
     for title, agents in tasks.items():
         paths = list(itertools.chain(*agents.values()))
@@ -703,7 +698,7 @@ def check_numbers(config: Config) -> None:
     """Raise ValueError for the first number that cannot work."""
     for name, low in (("levels", 1), ("repeats", 1), ("max_steps", 1), ("seed", 0)):
         if not low <= getattr(config, name) < 2**63:
-            raise ValueError(f"{ppo_gru.flag(name)} is {getattr(config, name)}; it must be from {low} to 2 ** 63 - 1")
+            raise ValueError(f"{flag(name)} is {getattr(config, name)}; it must be from {low} to 2 ** 63 - 1")
     if (episodes := config.levels * config.repeats) > MOST_EPISODES:
         raise ValueError(f"--levels x --repeats is {episodes}; at most {MOST_EPISODES} are played")
 

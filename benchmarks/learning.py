@@ -40,6 +40,8 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
 
 import evaluate
+from ppo_utils.flags import check_args
+from ppo_utils.runs import parse_args
 
 ROOT = Path(__file__).parent.parent
 COMMON = "--preset laptop --save-model"
@@ -204,8 +206,8 @@ class Config(Training):
     tasks: tuple[str, ...] = ()
     """other tasks than the suite's, of those that this program knows"""
     agents: tuple[str, ...] = ()
-    """other agents than the suite's, of those that this program knows, each alone or with further flags, e.g.
-    "TrXL --trxl-num-layers 3" """
+    """other agents than the suite's: those that this program knows, or scripts beside ppo_gru.py, each alone or with
+    further flags, e.g. "TrXL --trxl-num-layers 3" ppo_mingru.py"""
     out: Path = Path("learning/curves")
     """draw the curves to OUT.png and OUT.svg"""
 
@@ -248,11 +250,12 @@ def check(config: Training) -> None:
 @functools.cache
 def parse(script: str, *flags: str) -> Any:
     """Return what a script's flags stand for; tyro takes a tenth of a second, so that seeds and claims share it."""
-    return importlib.import_module(Path(script).stem).parse_args([*flags])
+    module = importlib.import_module(Path(script).stem)
+    return parse_args(module.Args, module.PRESETS, [*flags])
 
 
 def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
-    """Plan a training run; an agent is a name in `AGENTS`, which further flags may follow.
+    """Plan a training run; an agent is a name in `AGENTS` or another script, which further flags may follow.
 
     Raises SystemExit for flags that the script refuses, or that belong to the suite.
     """
@@ -264,7 +267,7 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
         "exp_name": file_name(agent),
     }
     name, dashes, further = agent.partition(" --")
-    script, *memory = AGENTS[name].split()
+    script, *memory = AGENTS.get(name, name).split()
     flags = [*COMMON.split(), *memory, *task.flags.split(), *(task.trxl_flags.split() if "trxl" in script else [])]
     flags += ["--anneal-steps", str(steps)]
     for each, value in of_the_suite.items():
@@ -273,7 +276,7 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
     try:
         parsed = parse(script, *flags)
         args = replace(parsed, seed=seed)
-        importlib.import_module(Path(script).stem).check_args(args)
+        check_args(args)
     except (ValueError, OSError) as error:
         raise SystemExit(f"{agent}: {error}") from None
     theirs = {each: getattr(args, each) for each in of_the_suite}
@@ -505,7 +508,9 @@ def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
     suite_tasks, suite_agents = SUITES[config.suite]
     tasks = config.tasks or suite_tasks
     agents = {name: suite_agents.get(name, name) for name in config.agents} or suite_agents
-    for given, known in ((tasks, TASKS), ([agent.partition(" --")[0] for agent in agents.values()], AGENTS)):
+    scripts = {path.name: path for path in ROOT.glob("ppo_*.py")}
+    names = [agent.partition(" --")[0] for agent in agents.values()]
+    for given, known in ((tasks, TASKS), (names, AGENTS | scripts)):
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"there is no {unknown[0]!r}; there are {'; '.join(known)}")
     return {

@@ -30,6 +30,8 @@ import tyro
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
 
 import evaluate
+from ppo_utils.checkpoints import checkpoints_in, save_checkpoint
+from ppo_utils.runs import close, parse_args
 
 FLAGS = "--preset laptop --env-id MysteryPath-Grid-v0 --num-envs 4 --num-steps 32 --num-minibatches 2 --no-cuda"
 
@@ -56,7 +58,7 @@ class Config:
 
 def arguments(iterations: int, name: str) -> list[str]:
     """Return the command line of a run that evaluates now and then, and writes a checkpoint every iteration."""
-    often = "--checkpoint-interval 1 --eval-interval 10 --eval-levels 2 --eval-repeats 1"
+    often = "--checkpoint-interval 1 --eval-interval 10 --eval-levels 2"
     return [*FLAGS.split(), *often.split(), "--total-timesteps", str(iterations * 4 * 32), "--exp-name", name]
 
 
@@ -64,7 +66,7 @@ def train(script: str, flags: list[str]) -> None:
     """Train as the command line does, but silently."""
     sys.stderr = open(os.devnull, "w")  # noqa: SIM115 (until the process ends)
     module = importlib.import_module(script)
-    module.main(module.parse_args(flags))
+    module.main(parse_args(module.Args, module.PRESETS, flags))
 
 
 def comes_to_its_end(script: str, flags: list[str], seconds: float | None) -> bool:
@@ -124,7 +126,7 @@ def kill(config: Config) -> None:
 def soak(config: Config) -> None:
     """Train for so many iterations, a checkpoint after each, and print what they take, a row for each fifth."""
     script = importlib.import_module(config.script)
-    args = script.parse_args([*arguments(1, "soak"), "--eval-interval", "0"])
+    args = parse_args(script.Args, script.PRESETS, [*arguments(1, "soak"), "--eval-interval", "0"])
     run = script.setup(args)
     batch_size, rows = args.total_timesteps, []
     for _ in range(config.soak):
@@ -133,7 +135,7 @@ def soak(config: Config) -> None:
         args.total_timesteps += batch_size
         resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
         rows.append((resident, len(os.listdir("/proc/self/fd")), batch_size / (time.perf_counter() - began)))
-    script.close(run)
+    close(run)
     print(f"\n{config.script}, a checkpoint after each of {config.soak} iterations\n")
     print("| iterations | resident memory, MiB | open files | steps per second |\n|---|---:|---:|---:|")
     for part in np.array_split(np.arange(config.soak), min(5, config.soak)):
@@ -148,17 +150,17 @@ def cost(config: Config) -> None:
     print("| preset | environments x steps | iteration, s | checkpoint, s | MiB | share |")
     print("|---|---|---:|---:|---:|---:|")
     for preset in script.PRESETS:
-        args = script.parse_args(["--preset", preset, "--no-cuda", "--exp-name", preset])
+        args = parse_args(script.Args, script.PRESETS, ["--preset", preset, "--no-cuda", "--exp-name", preset])
         args.total_timesteps = args.num_envs * args.num_steps
         run = script.setup(args)
         script.train(args, run)
         seconds = []
         for _ in range(5):
             began = time.perf_counter()
-            script.save_checkpoint(args, run)
+            save_checkpoint(args, run)
             seconds.append(time.perf_counter() - began)
-        size = script.checkpoints_in(run.folder)[-1].stat().st_size / 2**20
-        script.close(run)
+        size = checkpoints_in(run.folder)[-1].stat().st_size / 2**20
+        close(run)
         taken = float(np.median(seconds))
         share = taken / (args.checkpoint_interval * run.seconds)
         shape = f"{args.num_envs} x {args.num_steps}"

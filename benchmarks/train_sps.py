@@ -30,6 +30,8 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
+from ppo_utils.runs import close, parse_args
+
 
 @dataclass
 class Config:
@@ -86,7 +88,7 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, in
     """Return the steps/s of the script and of both bounds, the share of distinct pictures, and the best piece."""
     script = importlib.import_module(config.script)
     flags = ["--env-id", config.env_id, "--num-envs", str(config.num_envs), "--num-steps"]
-    args = script.parse_args([*flags, str(num_steps), *config.flags])
+    args = parse_args(script.Args, script.PRESETS, [*flags, str(num_steps), *config.flags])
     args.total_timesteps = config.num_envs * num_steps  # of one call of train
     args.checkpoint_interval = 0
     short = replace(args, num_steps=32)
@@ -108,7 +110,7 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, in
     for _ in range(config.rounds):
         for name, iteration in work.items():
             times[name].append(seconds(iteration, device))
-    script.close(run)
+    close(run)
     steps = config.num_envs * num_steps
     distinct = sum(encoded) / (config.rounds * args.update_epochs * steps)
     return {name: steps / statistics.median(taken) for name, taken in times.items()}, distinct, best

@@ -57,7 +57,7 @@ def kept_for_backward(run, args: ppo_trxl.Args) -> list[torch.Tensor]:
     minibatch = next(memory.cut(rollout.terminated).minibatches(args.num_minibatches))
     x = torch.randn(int(minibatch.length.sum()), memory.width, requires_grad=True)
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        memory.unroll(x, minibatch, rollout.memory_state)
+        memory.unroll(rollout.memory, x, minibatch)
     weights = {parameter.untyped_storage().data_ptr() for parameter in memory.parameters()}
     return [tensor for tensor in kept if tensor.untyped_storage().data_ptr() not in weights]
 
@@ -68,10 +68,10 @@ def shares(config: Config) -> None:
     run = ppo_trxl.setup(args)
     ppo_trxl.train(args, run)
     resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6  # kilobytes on Linux
-    memory = run.rollout.memory_state
+    memory = run.rollout.memory
     rows = {
         "highest resident memory, all in all": resident,
-        "stored block inputs": megabytes([memory.items, memory.item_steps]),
+        "stored hidden states": megabytes([memory.hidden, memory.stored_step]),
         "cache of keys and values": megabytes([memory.keys, memory.values]),
         "kept of a minibatch for the backward pass": megabytes(kept_for_backward(run, args)),
     }
@@ -92,13 +92,14 @@ def step_times(config: Config, window: int) -> tuple[float, float]:
     step, attention = [], []
     for _ in range(config.repeats):
         start = time.perf_counter()
-        _, state = memory.step(x, state)
+        _, hidden = memory.step(state, x)
+        memory.store(state, hidden)
         step.append(time.perf_counter() - start)
-        rows, _, seen = memory.look_back(state)
+        rows, _, mask = memory.attended_rows(state)
         start = time.perf_counter()
         for keys, values in zip(state.keys, state.values, strict=True):
             F.scaled_dot_product_attention(
-                split(x[:, None]), split(keys[:, rows]), split(values[:, rows]), seen[:, None]
+                split(x[:, None]), split(keys[:, rows]), split(values[:, rows]), mask[:, None]
             )
         attention.append(time.perf_counter() - start)
     return statistics.median(step), statistics.median(attention)

@@ -64,9 +64,11 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
 
-from evaluate import SCRIPTS
+import ppo_gru
+import ppo_trxl
 from learning import SMALL, TASKS, Task
-from ppo_gru import as_flags, flag
+from ppo_utils.flags import as_flags, flag
+from ppo_utils.runs import close, parse_args
 
 try:
     import optuna
@@ -90,6 +92,9 @@ def log_range(low: float, high: float) -> BaseDistribution:
 def one_of(*choices: Any) -> BaseDistribution:
     """Return a parameter that takes one of these values."""
     return CategoricalDistribution(choices)
+
+
+SCRIPTS = {"ppo_gru": ppo_gru, "ppo_trxl": ppo_trxl}
 
 
 # ---- SPACE ----
@@ -183,9 +188,14 @@ def settings(params: dict[str, Any]) -> dict[str, Any]:
     return {**rounded, "num_envs": int(num_envs), "num_steps": int(num_steps)}
 
 
+def parse(script: str, *flags: str) -> Any:
+    """Return the script's Args for these flags."""
+    return parse_args(SCRIPTS[script].Args, SCRIPTS[script].PRESETS, [*flags])
+
+
 def preset_params(script: str) -> dict[str, Any]:
     """Return the parameters that stand for --preset laptop: the inverse of `settings`."""
-    args = SCRIPTS[script].parse_args(["--preset", "laptop"])
+    args = parse(script, "--preset", "laptop")
     translated = {
         "layout": f"{args.num_envs}x{args.num_steps}",
         "final_lr_fraction": args.final_lr / args.init_lr,
@@ -198,10 +208,10 @@ def arguments(config: Config, task: Task, params: dict[str, Any], seed: int, nam
     """Return the script's Args to train with on a task. The task's own flags give way to the parameters."""
     total = int(task.total_timesteps * config.steps_scale)
     return replace(
-        SCRIPTS[config.script].parse_args(["--preset", "laptop", *task.flags.split()]),
+        parse(config.script, "--preset", "laptop", *task.flags.split()),
         **settings(params),
         **{"env_id": task.env_id, "env_options": json.dumps(task.options), "exp_name": name, "seed": seed},
-        **{"total_timesteps": total, "anneal_steps": total, "cuda": False},
+        **{"total_timesteps": total, "anneal_steps": total, "cuda": False, "checkpoint_interval": 0},
     )
 
 
@@ -235,12 +245,11 @@ def slices(script: ModuleType, args: Any, task: Task) -> Iterator[float]:
     A slice in which no episode ended has the last one's, and after a training has diverged all are 0.
     """
     run = start(script, args)
-    batch_size = args.num_envs * args.num_steps
     last = 0.0
-    first_steps = np.arange(args.total_timesteps // batch_size) * batch_size
+    iterations = np.arange(args.total_timesteps // (args.num_envs * args.num_steps))
     try:
-        for part in np.array_split(first_steps, SLICES):
-            scores = [each for step in part.tolist() for each in iteration(script, args, run, step, task.metric)]
+        for part in np.array_split(iterations, SLICES):
+            scores = [each for _ in part for each in iteration(script, args, run, task.metric)]
             last = normalized(task, scores) if scores else last
             generator = torch.get_rng_state()
             yield last
@@ -249,7 +258,7 @@ def slices(script: ModuleType, args: Any, task: Task) -> Iterator[float]:
         while True:
             yield 0.0
     finally:
-        script.close(run)
+        close(run)
 
 
 def start(script: ModuleType, args: Any) -> Any:
@@ -257,32 +266,19 @@ def start(script: ModuleType, args: Any) -> Any:
     with contextlib.redirect_stderr(io.StringIO()):
         run = script.setup(args)
     run.writer.close()
+    run.bar.close()
     shutil.rmtree(run.folder)
+    run.writer = run.bar = None
     return run
 
 
-def iteration(script: ModuleType, args: Any, run: Any, step: int, metric: str) -> list[float]:
-    """Train for an iteration, as the script's `train` does; return the scores of the episodes that ended in it.
+def iteration(script: ModuleType, args: Any, run: Any, metric: str) -> list[float]:
+    """Train for an iteration; return the scores of the episodes that ended in it.
 
     Raises FloatingPointError if the training diverges.
     """
-    rollout = run.rollout
-    run.optimizer.param_groups[0]["lr"].fill_(script.anneal(step, args.init_lr, args.final_lr, args.anneal_steps))
-    ent_coef = script.anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
-    last_value, episodes = script.collect(run.agent, run.envs, rollout, args)
-    rollout.advantages = script.gae(
-        rewards=rollout.rewards,
-        values=rollout.values,
-        last_value=last_value,
-        terminated=rollout.terminated,
-        truncated=rollout.truncated,
-        truncation_values=rollout.truncation_values,
-        gamma=args.gamma,
-        gae_lambda=args.gae_lambda,
-    )
-    rollout.returns = rollout.advantages + rollout.values
-    script.update(run.agent, run.optimizer, rollout, ent_coef, args)
-    return episodes.get("charts/episodic_return" if metric == "return" else f"episode/{metric}", [])
+    script.train(replace(args, total_timesteps=run.step + args.num_envs * args.num_steps), run)
+    return run.episodes.get("charts/episodic_return" if metric == "return" else f"episode/{metric}", [])
 
 
 def run_trial(trial: optuna.Trial, config: Config) -> float | None:

@@ -20,7 +20,6 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
 
 import evaluate
-import ppo_trxl
 
 
 @dataclass
@@ -39,11 +38,12 @@ class Config:
     """steps after which an endless episode is cut short"""
 
 
-def row(checkpoint: evaluate.Checkpoint, window: int, metric: str) -> str:
+def row(checkpoint: evaluate.Checkpoint, window: int, metric: str, settings: evaluate.Config) -> str:
     """Return the row of a window; raise ValueError where an episode was cut short, which has no final score."""
-    played = evaluate.play(replace(checkpoint, args=replace(checkpoint.args, trxl_memory_length=window)), seed=1)
+    args = replace(checkpoint.args, trxl_memory_length=window)
+    played = evaluate.play(replace(checkpoint, args=args), settings)
     if not played["finished"].all():
-        limit = checkpoint.args.eval_max_steps
+        limit = settings.max_steps
         raise ValueError(f"with a window of {window}, --max-steps {limit} cut episodes short; give more steps")
     scores, lengths = played[metric], played["length"]
     name = f"{window}, as trained" if window == checkpoint.args.trxl_memory_length else str(window)
@@ -58,14 +58,12 @@ def main(config: Config) -> None:
         raise ValueError(f"--windows is {given}; give windows of 1 step or more")
     settings = evaluate.Config(levels=config.levels, repeats=config.repeats, max_steps=config.max_steps)
     evaluate.check_numbers(settings)
-    checkpoint = evaluate.Checkpoint.read(config.checkpoint, settings)
-    if checkpoint.script is not ppo_trxl:
+    checkpoint = evaluate.Checkpoint.read(config.checkpoint)
+    if not hasattr(checkpoint.args, "trxl_memory_length"):
         script = checkpoint.script.__name__
-        raise ValueError(
-            f"{config.checkpoint} was trained by {script}.py; only transformers of ppo_trxl.py have a window"
-        )
+        raise ValueError(f"{config.checkpoint} was trained by {script}.py; only transformers have a window")
     metric = evaluate.own_metric(checkpoint.args.env_id)
-    rows = [row(checkpoint, window, metric) for window in tqdm(config.windows, unit=" windows")]
+    rows = [row(checkpoint, window, metric, settings) for window in tqdm(config.windows, unit=" windows")]
     print(f"| window | {metric}, mean | IQM | length of an episode, median | longest |\n|---:|---:|---:|---:|---:|")
     print("\n".join(rows))
 

@@ -1,21 +1,11 @@
 """Memory Gym's environments, batched: importing this package registers their ids with Gymnasium.
 
-`gym.make(id)` makes one environment, `gym.make_vec(id, num_envs=N)` N of them in one object, and
-`memory_gym_envs.make_envs(id, N)` N of any Gymnasium id as a training script takes them.
+`gym.make(id)` makes one environment, and `gym.make_vec(id, num_envs=N)` N of them in one object.
 """
 
 from gymnasium.envs.registration import register
 
 from memory_gym_envs.base import MemoryGymVectorEnv
-from memory_gym_envs.making import (
-    final_numbers,
-    final_observations,
-    is_memory_gym,
-    load_state,
-    make_envs,
-    parse_options,
-    save_state,
-)
 from memory_gym_envs.mortar_mayhem import MortarMayhem
 from memory_gym_envs.mystery_path import MysteryPath
 from memory_gym_envs.options import Option, options_table
@@ -30,14 +20,7 @@ __all__ = [
     "MysteryPath",
     "Option",
     "SearingSpotlights",
-    "final_numbers",
-    "final_observations",
-    "is_memory_gym",
-    "load_state",
-    "make_envs",
     "options_table",
-    "parse_options",
-    "save_state",
 ]
 
 FAMILIES = (MortarMayhem, MysteryPath, SearingSpotlights)

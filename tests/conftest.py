@@ -2,6 +2,9 @@ import os
 
 os.environ["OMP_NUM_THREADS"] = "1"  # of the programs that tests start, too: as many threads, to the bit the same
 
+import importlib
+from pathlib import Path
+
 import cue_recall  # noqa: F401 (registers CueRecall-v0)
 import pytest
 import torch
@@ -11,11 +14,19 @@ from tensorboard.util.tensor_util import make_ndarray
 
 import ppo_gru
 import ppo_trxl
+from ppo_utils import runs
 
 torch.set_num_threads(1)  # the networks here are so small that threads would mostly wait for each other
 # TensorBoard reads the files of a run in the order of their names: the second, then a process's count of its files,
 # where 10 comes before 9. Only tests open two files of a run within a second.
 event_file_writer._global_uid = event_file_writer.AtomicCounter(1000)
+
+ROOT = Path(__file__).parents[1]
+# A script with another memory needs no more than to lie beside these two: its memory is held to the same contract.
+OTHERS = [importlib.import_module(path.stem) for path in sorted(ROOT.glob("ppo_*.py"))]
+OTHERS = [script for script in OTHERS if script not in (ppo_gru, ppo_trxl)]
+SCRIPTS = [ppo_gru, ppo_trxl, *OTHERS]
+SMALL = {"hidden_size": 32, "trxl_dim": 32, "trxl_num_heads": 2, "trxl_num_layers": 2, "trxl_memory_length": 7}
 
 
 @pytest.fixture(autouse=True)
@@ -24,10 +35,9 @@ def own_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-SMALL = {
-    ppo_gru: {"hidden_size": 32},
-    ppo_trxl: {"trxl_dim": 32, "trxl_num_heads": 2, "trxl_num_layers": 2, "trxl_memory_length": 7},
-}
+def parse_args(script, *flags):
+    """What a script's command line stands for."""
+    return runs.parse_args(script.Args, script.PRESETS, [*flags])
 
 
 @pytest.fixture(scope="session")
@@ -35,7 +45,8 @@ def tiny():
     """Arguments of a script for a training of two short iterations; keyword arguments replace some of them."""
 
     def make(script=ppo_gru, **changes):
-        few = {"num_envs": 4, "num_steps": 16, "num_minibatches": 2, "update_epochs": 2, **SMALL[script]}
+        small = {name: size for name, size in SMALL.items() if hasattr(script.Args, name)}
+        few = {"num_envs": 4, "num_steps": 16, "num_minibatches": 2, "update_epochs": 2, **small}
         return script.Args(**{"cuda": False, "total_timesteps": 128, **few, **changes})
 
     return make
@@ -74,13 +85,27 @@ def curves():
 
 
 @pytest.fixture
-def played(tiny):
+def opened():
+    """Set up runs, which are closed when the test ends."""
+    found = []
+
+    def open_run(script, args):
+        found.append(script.setup(args))
+        return found[-1]
+
+    yield open_run
+    for run in found:
+        runs.close(run)
+
+
+@pytest.fixture
+def played(tiny, opened):
     """Set up an agent and play some rollouts, without learning; the last one stays in run.rollout, its
     advantages and returns are zeros."""
 
     def play(iterations=1, weights_scale=1.0, script=ppo_gru, **changes):
         args = tiny(script, **changes)
-        run = script.setup(args)
+        run = opened(script, args)
         with torch.no_grad():  # the initial policy hardly depends on its input; a test needs one that does
             for parameter in run.agent.heads.parameters():
                 parameter.mul_(weights_scale)

@@ -12,6 +12,8 @@ from torch.nn import functional as F
 import ppo_gru
 import ppo_trxl
 from ppo_gru import Agent, Args, Decoder, reconstruction_loss
+from ppo_utils.checkpoints import read_model
+from ppo_utils.environments import envs_for
 
 HEADS = {"reconstruction_coef": 0.1, "ground_truth_coef": 0.1}
 SCRIPTS = pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
@@ -24,8 +26,7 @@ def loss_of(script, args, run):
     run.rollout.advantages.zero_()
     run.rollout.returns.zero_()
     run.agent.zero_grad()
-    observations = script.UniqueObservations(run.rollout.obs, run.agent)
-    loss, logs = script.ppo_loss(run.agent, run.rollout, observations, pieces, 0.0, args)
+    loss, logs = script.ppo_loss(run.agent, run.rollout, pieces, 0.0, args)
     loss.backward()
     return loss.detach(), logs, {name: p.grad for name, p in run.agent.named_parameters() if p.grad is not None}
 
@@ -64,7 +65,7 @@ def test_the_losses_are_means_over_real_steps(played, script):
     obs = {name: part.flatten(0, 1)[order] for name, part in run.rollout.obs.items()}
     with torch.no_grad():
         actions = run.rollout.actions.flatten(0, 1)[order]
-        features = run.agent.evaluate_actions(run.agent.encoder(obs), actions, pieces, run.rollout.memory_state)[3]
+        features = run.agent.evaluate_actions(run.agent.encoder(obs), actions, pieces, run.rollout.memory)[3]
         drawn = torch.sigmoid(run.agent.decoder(features))
         wanted = obs["visual_observation"] / 255
         truths = run.rollout.ground_truth.flatten(0, 1)[order]
@@ -80,7 +81,7 @@ def test_the_losses_are_means_over_real_steps(played, script):
 def test_the_ground_truth_belongs_to_the_observation(played, script):
     """The same actions, played again: what the infos said when an observation was handed out."""
     args, run, *_ = played(script=script, env_id="MortarMayhemB-Grid-v0", num_steps=32, num_minibatches=1, **HEADS)
-    envs = script.environments(args, args.num_envs, seed=args.seed)
+    envs = envs_for(args, args.num_envs, seed=args.seed)
     _, infos = envs.reset()
     assert run.rollout.terminated.any()
     for t in range(32):
@@ -125,11 +126,11 @@ def test_heads_that_are_off_cost_nothing(played):
     assert not {name for name in loss_of(ppo_gru, args, run)[1] if "reconstruction" in name or "truth" in name}
 
 
-def test_a_head_can_be_added_to_a_trained_agent(tiny):
+def test_a_head_can_be_added_to_a_trained_agent(tiny, opened):
     """A probe after the training (5.1.2): the agent is the saved one, the head is new."""
     (path,) = Path(ppo_gru.main(tiny(env_id="MortarMayhem-Grid-v0", save_model=True))).glob("model.pt")
-    run = ppo_gru.setup(tiny(env_id="MortarMayhem-Grid-v0", load_model=str(path), ground_truth_coef=0.1))
-    weights = ppo_gru.read_model(path)["weights"]
+    run = opened(ppo_gru, tiny(env_id="MortarMayhem-Grid-v0", load_model=str(path), ground_truth_coef=0.1))
+    weights = read_model(path)["weights"]
     assert all(run.agent.state_dict()[name].equal(weight) for name, weight in weights.items())
 
 

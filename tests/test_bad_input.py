@@ -1,6 +1,5 @@
 """Bad input ends in one line that says what is wrong and what would be right, and writes nothing."""
 
-import errno
 import glob
 import os
 import re
@@ -8,11 +7,15 @@ import subprocess
 import sys
 import types
 
+import gymnasium as gym
 import pytest
 import torch
+from conftest import SCRIPTS, parse_args
 
 import ppo_gru
 import ppo_trxl
+from ppo_utils import runs
+from ppo_utils.flags import check_args, check_minibatches
 
 SCRIPT = os.path.abspath(ppo_gru.__file__)
 CASES = {
@@ -42,8 +45,8 @@ CASES = {
     "--env-id CueRecall-v0 --capture-video": "needs an environment that draws pictures .*; CueRecall-v0 draws none",
     "--target-kl nan": "--target-kl is nan; it must be above 0",
     "--ground-truth-detach": "--ground-truth-detach needs --ground-truth-coef above 0",
-    "--memory none --seq-len 5": "--seq-len needs --memory gru or lstm; without, it changes nothing",
-    "--memory none --refresh-memory": "--refresh-memory needs --memory gru or lstm",
+    "--memory none --seq-len 5": "--seq-len, --num-layers and --refresh-memory need --memory gru or lstm",
+    "--memory none --refresh-memory": "--refresh-memory need --memory gru or lstm",
     "--env-id .foo:x-v0": "the module of .foo:x-v0 begins with a dot",
     "--capture-video --load-model missing.pt": "there is no file missing.pt",
     "--load-model missing.pt": "there is no file missing.pt; --save-model writes model.pt",
@@ -54,7 +57,7 @@ TRANSFORMER_CASES = {
     "--trxl-num-heads 5": "--trxl-dim is 384; it must be even and a multiple of --trxl-num-heads",
     "--trxl-dim 9 --trxl-num-heads 3": "--trxl-dim is 9; it must be even",
     "--trxl-memory-length 0": "--trxl-memory-length is 0; it must be 1 or more",
-    "--trxl-gate-bias inf": "--trxl-gate-bias is inf; it must be a finite number",
+    "--trxl-gate-bias inf": "--trxl-gate-bias is inf; it must be -100 to 100",
     "--trxl-gate-bias 2": "--trxl-gate-bias needs --trxl-gate gru; without, it changes nothing",
     "--trxl-pe-length 300": "--trxl-pe-length needs --trxl-positional-encoding learned",
     "--num-minibatches 200": "may have only 128 sequences .* at most that many, or more environments",
@@ -67,8 +70,9 @@ def run(flags, cwd):
 
 
 def setup_error(args, script=ppo_gru):
+    """What a setup that fails says."""
     before = os.path.exists("runs") and os.listdir("runs")
-    with pytest.raises((ValueError, OSError, ImportError, script.gym.error.Error)) as error:
+    with pytest.raises((ValueError, OSError, ImportError, gym.error.Error)) as error:
         script.setup(args)
     assert (os.path.exists("runs") and os.listdir("runs")) == before, "nothing half-written"
     return str(error.value)
@@ -76,13 +80,13 @@ def setup_error(args, script=ppo_gru):
 
 @pytest.mark.parametrize("line", CASES)
 def test_setup_names_the_fault(line):
-    message = setup_error(ppo_gru.parse_args(line.split()))
+    message = setup_error(parse_args(ppo_gru, *line.split()))
     assert re.search(CASES[line], message), message
 
 
 @pytest.mark.parametrize("line", TRANSFORMER_CASES)
 def test_setup_names_the_transformer_s_fault(line):
-    message = setup_error(ppo_trxl.parse_args(line.split()), ppo_trxl)
+    message = setup_error(parse_args(ppo_trxl, *line.split()), ppo_trxl)
     assert re.search(TRANSFORMER_CASES[line], message), message
 
 
@@ -114,30 +118,20 @@ def test_wrong_flags(line, tmp_path):
 
 
 def test_infinity_is_no_limit(tiny):
-    ppo_gru.check_args(tiny(max_grad_norm=float("inf"), clip_coef=float("inf"), target_kl=float("inf")))
+    check_args(tiny(max_grad_norm=float("inf"), clip_coef=float("inf"), target_kl=float("inf")))
 
 
-def test_two_runs_do_not_share_a_folder(tiny, monkeypatch):
-    """Even when both have named it before either made it."""
-    first = ppo_gru.setup(tiny(env_id="CueRecall-v0")).folder
-    names = iter([first, first.with_name("another")])
-    monkeypatch.setattr(ppo_gru, "new_folder", lambda args: next(names))
-    assert ppo_gru.setup(tiny(env_id="CueRecall-v0")).folder == first.with_name("another")
+def test_a_file_system_without_locks(tiny, opened, monkeypatch):
+    def acquire(*_, **__):
+        raise NotImplementedError("FileSystem does not appear to support flock")
 
-
-def test_a_file_system_without_locks(tiny, monkeypatch):
-    if ppo_gru.fcntl is None:
-        pytest.skip("this system has no locks either")
-
-    def flock(*_):
-        raise OSError(errno.ENOSYS, "Function not implemented")
-
-    monkeypatch.setattr(ppo_gru.fcntl, "flock", flock)
-    assert ppo_gru.setup(tiny(env_id="CueRecall-v0")).folder.is_dir()
+    monkeypatch.setattr(runs.FileLock, "acquire", acquire)
+    assert opened(ppo_gru, tiny(env_id="CueRecall-v0")).folder.is_dir()
 
 
 def test_as_many_minibatches_as_steps_without_memory(tiny):
-    ppo_gru.check_args(tiny(memory="none", num_minibatches=64))
+    args = tiny(memory="none", num_minibatches=64)
+    check_minibatches(args, ppo_gru.Memory.longest_piece(args))
 
 
 @pytest.mark.parametrize("error", [RuntimeError("not enough memory: you tried to allocate a lot"), MemoryError()])
@@ -205,23 +199,8 @@ def test_missing_extras(tiny, monkeypatch):
     assert setup_error(tiny(track=True)) == '--track needs wandb: pip install -e ".[track]"'
 
 
-def test_an_episode_that_outlasts_a_learned_encoding(tmp_path):
-    """One line, and what was learned is kept."""
-    flags = "--env-id MysteryPath-Grid-v0 --obs-type vector --trxl-positional-encoding learned --trxl-pe-length 40"
-    sizes = "--trxl-dim 8 --trxl-num-heads 1 --num-envs 2 --num-steps 32 --num-minibatches 2 --total-timesteps 640"
-    command = [sys.executable, ppo_trxl.__file__, *flags.split(), *sizes.split(), "--no-cuda", "--save-model"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 1
-    last = done.stderr.strip().splitlines()[-1]
-    assert re.match(r"ppo_trxl\.py: iteration \d+: --trxl-pe-length is 40, but an episode is longer; make it", last), (
-        last
-    )
-    assert "Traceback" not in done.stderr
-    assert len(list(tmp_path.glob("runs/*/model.pt"))) == 1
-
-
-@pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
-def test_a_training_that_diverges(tiny, script):
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_training_that_diverges(tiny, opened, script):
     args = tiny(script, env_id="CueRecall-v0", vf_coef=1e38, total_timesteps=640, save_model=True)
     with pytest.raises(
         FloatingPointError,
@@ -229,15 +208,15 @@ def test_a_training_that_diverges(tiny, script):
     ):
         script.main(args)
     assert not glob.glob("runs/*/model.pt*"), "nothing is left of it"
-    run = script.setup(tiny(script, env_id="CueRecall-v0", exp_name="spoilt"))
+    run = opened(script, tiny(script, env_id="CueRecall-v0", exp_name="spoilt"))
     next(run.agent.parameters()).data.fill_(float("nan"))
     torch.save({"script": script.__name__, "args": {}, "weights": run.agent.state_dict()}, "spoilt.pt")
     message = setup_error(tiny(script, env_id="CueRecall-v0", load_model="spoilt.pt"), script)
     assert message == "spoilt.pt holds weights that are not finite: the training diverged"
 
 
-@pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
+@pytest.mark.parametrize("script", SCRIPTS)
 def test_a_choice_that_there_is_not(tiny, script):
     """On the command line tyro finds it."""
     with pytest.raises(ValueError, match="--norm-adv is 'yes'; it must be one of none, minibatch, batch"):
-        script.check_args(tiny(script, norm_adv="yes"))
+        check_args(tiny(script, norm_adv="yes"))

@@ -27,6 +27,7 @@ import learning
 import memory_gym_envs  # noqa: F401 (registers the ids)
 import ppo_gru
 import ppo_trxl
+from ppo_utils import flags, runs
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -78,8 +79,8 @@ def parser(module: ModuleType) -> Callable[[list[str]], object]:
 
 def parse_training(script: ModuleType, arguments: list[str]) -> object:
     """Parse a training's arguments; a run that it goes on with need not exist."""
-    with patch.object(script, "read_checkpoint", lambda folder: {"args": {}}):
-        return script.parse_args(arguments)
+    with patch.object(runs, "read_checkpoint", lambda folder: {"args": {}}):
+        return runs.parse_args(script.Args, script.PRESETS, arguments)
 
 
 def parse_with_argparse(main: Callable[[], None], arguments: list[str]) -> None:
@@ -128,7 +129,7 @@ def all_flags() -> set[str]:
     found = set()
     for path in PROGRAMS:
         source = path.read_text()
-        if "tyro.cli(" in source or "ArgumentParser(" in source:
+        if any(part in source for part in ("tyro.cli(", "ArgumentParser(", "class Args:")):
             with patch.dict(os.environ, COLUMNS="200"):
                 text = error(parser(import_program(str(path))), ["--help"])
             for line in re.findall(r"^[\s│]*((?:-\w, )?--\S.*)$", text, re.MULTILINE):
@@ -202,8 +203,10 @@ def test_command(page, command):
     assert wrong is None, f"{page}: {command}\n{wrong}"
     if hasattr(module, "Args") and "--resume" not in arguments:
         processes = int(given.nproc_per_node) * int(given.nnodes.split(":")[0]) if program == "torchrun" else 1
-        with patch.object(module, "rank_and_size", lambda: (0, processes)):
-            module.check_args(module.parse_args(arguments))
+        with patch.object(flags, "rank_and_size", lambda: (0, processes)):
+            args = parse_training(module, arguments)
+            flags.check_args(args)
+            flags.check_minibatches(args, module.Memory.longest_piece(args))
 
 
 DRAWN = sorted({call for _, call in COMMANDS.values() if "learning.py" in call and "--results benchmarks/res" in call})
@@ -254,21 +257,23 @@ def test_readme_names_the_sections(script):
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.__name__)
 def test_readme_names_the_memory_interface(script):
     section = README.read_text().split("## Add your own memory")[1].split("\n## ")[0]
-    methods = re.findall(r"^\| `(\w+)\(([^)]*)\)", section, re.MULTILINE)
+    methods = re.findall(r"`(\w+)\(([^)]*)\)`", section)
     assert len(methods) >= 5
     for name, parameters in methods:
         called = script.Memory.__init__ if name == "Memory" else getattr(script.Memory, name)
-        assert ["self", *parameters.split(", ")] == list(inspect.signature(called).parameters)
+        named = parameters.split(", ")
+        parameters = [name for name in inspect.signature(called).parameters if name != "self"]
+        assert parameters == ["state", "hidden"] if name == "store" else parameters == named
 
 
 def test_page_names_the_curves(tiny, scalars):
     page = (ROOT / "docs/logging.md").read_text()
     rows = re.findall(r"^\| (`\w+/.+?) \|", page, re.MULTILINE)
-    flags = {"env_id": "MortarMayhemB-Grid-v0", "total_timesteps": 256, "eval_interval": 4, "eval_levels": 2}
-    flags |= {"reconstruction_coef": 0.1, "ground_truth_coef": 0.1}
+    changes = {"env_id": "MortarMayhemB-Grid-v0", "total_timesteps": 256, "eval_interval": 4, "eval_levels": 2}
+    changes |= {"reconstruction_coef": 0.1, "ground_truth_coef": 0.1}
     logged = set()
     for script in SCRIPTS:
-        logged |= set(scalars(script.main(tiny(script, **flags))))
+        logged |= set(scalars(script.main(tiny(script, **changes))))
     logged = {re.sub("^(episode|eval)/.*", r"\1/NAME", name) for name in logged} | {"eval_levels/NAME"}
     named = {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
     assert named == logged

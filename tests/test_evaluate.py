@@ -9,6 +9,7 @@ import xml.etree.ElementTree
 from dataclasses import asdict
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -21,6 +22,9 @@ import evaluate
 import memory_gym_envs
 import ppo_gru
 import ppo_trxl
+from ppo_utils import evaluation
+from ppo_utils.checkpoints import load_weights, make_agent, read_model, saved_args
+from ppo_utils.environments import envs_for
 
 TASK = {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "num_levels": 10, "start_level": 5, "save_model": True}
 FEW = {"levels": 4, "repeats": 2, "cuda": False}
@@ -172,7 +176,7 @@ def test_the_same_step_twice_is_refused():
         evaluate.agents_of(runs)
 
 
-@pytest.mark.parametrize("name", ["resume", "checkpoint_interval", "keep_models"])
+@pytest.mark.parametrize("name", ["resume", "checkpoint_interval", "eval_interval"])
 def test_how_a_run_was_kept_makes_no_other_agent(name):
     runs = {"a": arguments(**{name: "1"}), "b": arguments(seed=2, **{name: "2"})}
     assert evaluate.agents_of(runs) == {"ppo_gru": ["a", "b"]}
@@ -192,7 +196,7 @@ def test_other_tasks_are_apart():
 def test_own_metric_is_told_by_the_environment(env_id):
     """6.1.3; every evaluation reports the return."""
     metric = evaluate.own_metric(env_id)
-    envs = ppo_gru.gym.make_vec(env_id, num_envs=1)
+    envs = gym.make_vec(env_id, num_envs=1)
     envs.reset(seed=0)
     assert metric in envs.summary(np.array([0])) or (metric, env_id) == ("return", "Endless-MysteryPath-v0")
 
@@ -257,7 +261,6 @@ def agents(tiny, tmp_path_factory):
         "total_timesteps": 1024,
         "eval_interval": 1,
         "eval_levels": 2,
-        "eval_repeats": 3,
     }
     folder = tmp_path_factory.mktemp("agents")
     with pytest.MonkeyPatch.context() as patch:
@@ -298,7 +301,7 @@ def test_a_curve_is_the_iqm_with_its_band(agents, scalars):
 def test_hyperparameters_are_those_of_the_run(agents):
     for folder in agents:
         script = ppo_trxl if "trxl" in folder else ppo_gru
-        args = script.saved_args(script.read_model(f"{folder}/model.pt"))
+        args = saved_args(script.Args, read_model(f"{folder}/model.pt"))
         text = {name: str(value) for name, value in asdict(args).items()}
         assert evaluate.read_run(folder).args == {"script": script.__name__} | text
 
@@ -339,7 +342,7 @@ def test_the_levels_of_an_older_run():
 
 def test_a_picture_goes_to_a_folder_that_is_not_there_yet():
     with SummaryWriter("run-1") as writer:
-        writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|1|\n|env_id|A-v0|\n|eval_repeats|2|")
+        writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|1|\n|env_id|A-v0|")
         writer.add_scalar("eval/return", 1.0, 10)
         writer.add_tensor("eval_levels/return", torch.tensor([[1.0, 2.0]]), 10)
     evaluate.draw_curves(evaluate.Config(curves=("run-1",), out="new/curves"))
@@ -349,7 +352,7 @@ def test_a_picture_goes_to_a_folder_that_is_not_there_yet():
 def test_a_table_says_whose_episodes_were_not_kept(capsys):
     for seed, scores in ((1, [1.0, 3.0]), (2, [[1.0, 2.0], [3.0, 4.0]])):
         with SummaryWriter(f"run-{seed}") as writer:
-            rows = f"|seed|{seed}|\n|env_id|A-v0|\n|eval_repeats|2|"
+            rows = f"|seed|{seed}|\n|env_id|A-v0|"
             writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
             writer.add_scalar("eval/return", np.mean(scores), 10)
             writer.add_tensor("eval_levels/return", torch.tensor(scores), 10)
@@ -369,9 +372,17 @@ def test_the_arguments_of_a_run_of_another_script():
 
 def test_a_model_of_another_script():
     torch.save({"script": "ppo_other", "args": {}, "weights": {}}, "model.pt")
-    for read in (lambda: evaluate.Checkpoint.read("model.pt", evaluate.Config()), lambda: enjoy.load("model.pt")):
-        with pytest.raises(ValueError, match=r"model\.pt was trained by ppo_other\.py, which is not among SCRIPTS"):
-            read()
+    for read in (evaluate.Checkpoint.read, enjoy.load):
+        with pytest.raises(ValueError, match=r"model\.pt was trained by ppo_other\.py, which is not here; run this be"):
+            read("model.pt")
+
+
+def test_a_file_names_no_other_module():
+    """A file from elsewhere must not have any module imported."""
+    torch.save({"script": "antigravity", "args": {}, "weights": {}}, "model.pt")
+    with pytest.raises(ValueError, match="was trained by antigravity"):
+        evaluate.Checkpoint.read("model.pt")
+    assert "antigravity" not in sys.modules
 
 
 # ---- curves over time ----
@@ -526,14 +537,13 @@ def test_scores_are_those_of_the_levels(agents, capsys):
     assert low <= trxl["metrics"]["num_fails"]["iqm"] <= high
     assert f"| num_fails | ppo_trxl | 2 | {falls.mean():.3f} |" in said
 
-    saved = ppo_trxl.read_model(models[2])
-    args = ppo_trxl.saved_args(saved)
-    args.eval_levels, args.eval_repeats = 4, 2
-    envs = ppo_trxl.environments(args, 8)
-    agent = ppo_trxl.make_agent(envs, {}, args, torch.device("cpu"))
-    ppo_trxl.load_weights(agent, saved, models[2])
+    saved = read_model(models[2])
+    args = saved_args(ppo_trxl.Args, saved)
+    envs = envs_for(args, 8)
+    agent = make_agent(ppo_trxl.Agent, envs, {}, args)
+    load_weights(agent, saved, models[2])
     torch.manual_seed(1)
-    found = ppo_trxl.evaluate(agent, envs, args)["num_fails"]
+    found = evaluation.evaluate(agent, envs, evaluation.evaluation_levels(args, 4, 2), 10_000)["num_fails"]
     assert falls[0].tolist() == [[found[2 * level], found[2 * level + 1]] for level in range(4)]
     assert len({tuple(level) for level in falls[0]}) > 1, "levels that can be told apart"
 
@@ -550,15 +560,14 @@ def test_several_files_of_a_run(agents, monkeypatch, capsys):
     """Files of two seeds at steps 512 and 1024, and one of the other agent that is at another step."""
     files = {f"{seed}/checkpoint-{step}.pt": (seed, step) for seed, step in itertools.product((0, 1), (1024, 512))}
     files["2/model.pt"] = (2, 2048)
-    read = ppo_gru.read_model
 
-    def read_model(path):
+    def read(path):
         run, step = files[path]
-        return read(f"{agents[run]}/model.pt") | {"step": step, "optimizer": {}}
+        return read_model(f"{agents[run]}/model.pt") | {"step": step, "optimizer": {}}
 
-    monkeypatch.setattr(ppo_gru, "read_model", read_model)
+    monkeypatch.setattr(evaluate, "read_model", read)
     config = evaluate.Config(tuple(files), max_steps=3, json="scores.json", **FEW)
-    assert evaluate.Checkpoint.read("2/model.pt", config).saved.keys() == {"script", "args", "weights"}
+    assert evaluate.Checkpoint.read("2/model.pt").saved.keys() == {"script", "args", "weights"}
     evaluate.main(config)
     (task,) = json.loads(Path("scores.json").read_text())
     assert {agent["agent"]: agent["runs"] for agent in task["agents"]} == {

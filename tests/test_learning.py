@@ -15,12 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import parse_args
 from tqdm import tqdm
 
 import claims
 import evaluate
 import learning
 import ppo_gru
+from ppo_utils.runs import run_to_end
 
 ROOT = Path(__file__).parents[1]
 
@@ -106,7 +108,7 @@ def test_an_agent_goes_on_with_no_other_run(tmp_path):
 
 def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, capsys):
     agent, task = "GRU, refreshed", learning.TASKS["mortar-mayhem"]
-    small = "--num-envs 4 --num-steps 32 --num-minibatches 2 --hidden-size 8 --eval-levels 2 --eval-repeats 1"
+    small = "--num-envs 4 --num-steps 32 --num-minibatches 2 --hidden-size 8 --eval-levels 2"
     monkeypatch.setattr(learning, "COMMON", f"{learning.COMMON} {small}")
     config = learning.Config(
         tasks=("mortar-mayhem",),
@@ -121,11 +123,11 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     config.folder.mkdir()
     monkeypatch.chdir(config.folder)
     plan = learning.plan(config, task, agent, 1)
-    args = ppo_gru.parse_args(plan.command[2:])
+    args = parse_args(ppo_gru, *plan.command[2:])
     assert args == plan.args
     run = ppo_gru.setup(args)
     run.received_signal = signal.SIGTERM  # during the first of three iterations
-    ppo_gru.run_to_end(args, run)
+    run_to_end(args, run, ppo_gru.train)
 
     def trainings():
         return learning.runs_in(str(config.folder / "runs"), plan)
@@ -145,7 +147,7 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     for name in (*scores, "charts/seconds_iteration", *evaluate.UPDATE_CURVES):
         for one, other in zip(kept.curves[name], whole.curves[name], strict=True):
             assert one == pytest.approx(other, rel=1e-3)
-    assert kept.curves["eval/return"][1].shape == (3, 2, 1)
+    assert kept.curves["eval/return"][1].shape == (3, 2, 3)
     carried_out = kept.curves["eval/carried_out"][1]
     assert carried_out == pytest.approx(kept.curves["eval/return"][1] / 0.4), "of four commands, 0.1 each"
 

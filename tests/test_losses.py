@@ -8,7 +8,7 @@ import torch
 from torch.distributions import Categorical
 
 import ppo_gru
-from ppo_gru import UniqueObservations, anneal, explained_variance, policy_loss, ppo_loss, value_loss
+from ppo_gru import anneal, explained_variance, policy_loss, ppo_loss, value_loss
 
 
 def test_policy_loss_clips_every_branch_by_itself():
@@ -75,18 +75,17 @@ def test_the_total_loss_is_composed_as_in_equation_5_7(played):
         rollout.log_probs.fill_(math.log(0.5))  # what this uniform policy would have stored
     pieces = agent.memory.cut(rollout.terminated)
     rollout.advantages, rollout.returns = rollout.rewards + 1, rollout.rewards
-    observations = UniqueObservations(rollout.obs, agent)
-    loss, logs = ppo_loss(agent, rollout, observations, pieces, 5.0, args)
+    loss, logs = ppo_loss(agent, rollout, pieces, 5.0, args)
     assert logs["entropy"].item() == pytest.approx(2 * math.log(2)), "the sum over both branches"
     assert logs["log_barrier"].item() == pytest.approx(2 * math.log(0.5)), "the same"
     assert logs["policy_loss"].item() == pytest.approx(-rollout.advantages.mean().item())
     parts = logs["policy_loss"] + 3.0 * logs["value_loss"] - 5.0 * logs["entropy"]
     assert loss.item() == pytest.approx(parts.item())
     barrier = dataclasses.replace(args, exploration_bonus="log-barrier")
-    other = ppo_loss(agent, rollout, observations, pieces, 5.0, barrier)[0]
+    other = ppo_loss(agent, rollout, pieces, 5.0, barrier)[0]
     assert (other - loss).item() == pytest.approx(5.0 * (logs["entropy"] - logs["log_barrier"]).item())
     normalize = dataclasses.replace(args, norm_adv="minibatch")
-    normalized = ppo_loss(agent, rollout, observations, pieces, 5.0, normalize)[1]
+    normalized = ppo_loss(agent, rollout, pieces, 5.0, normalize)[1]
     assert normalized["policy_loss"].item() == pytest.approx(0.0, abs=1e-5), "advantages of mean zero"
 
 

@@ -1,18 +1,21 @@
 """The invariants of a memory: what the update recomputes is what the rollout saw, and nothing leaks."""
 
 import contextlib
+import copy
 import math
 
 import numpy as np
 import pytest
 import torch
-from conftest import SMALL
+from conftest import OTHERS, SCRIPTS, parse_args
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 import ppo_gru
 import ppo_trxl
+from ppo_utils import fast
+from ppo_utils.environments import envs_for
 
 RECURRENT = [
     {"memory": "gru"},
@@ -28,6 +31,8 @@ TRANSFORMER = [
     {"script": ppo_trxl, "trxl_memory_gradient": True, "trxl_segment_length": 5},
     {"script": ppo_trxl, "trxl_layer_norm": "post", "trxl_query_output": True, "trxl_segment_length": 5},
 ]
+for script in OTHERS:  # a copy of either script, with another memory
+    (TRANSFORMER if hasattr(script.Args, "trxl_segment_length") else RECURRENT).append({"script": script})
 WITH_MEMORY = [*RECURRENT, *TRANSFORMER]
 MEMORIES = [*WITH_MEMORY, {"memory": "none"}]
 
@@ -45,21 +50,15 @@ def recompute(run):
     index = pieces.flat_index()
     x = run.agent.encoder({name: part.flatten(0, 1)[index] for name, part in rollout.obs.items()})
     actions = rollout.actions.flatten(0, 1)[index]
-    _, log_probs, values, _ = run.agent.evaluate_actions(x, actions, pieces, rollout.memory_state)
+    _, log_probs, values, _ = run.agent.evaluate_actions(x, actions, pieces, rollout.memory)
     return index, (log_probs - rollout.log_probs.flatten(0, 1)[index]).exp(), values
 
 
-def loss_of(script, args, run, pieces, ent_coef=1e-3):
-    """The loss of the pieces, and what it logs."""
-    observations = script.UniqueObservations(run.rollout.obs, run.agent)
-    return script.ppo_loss(run.agent, run.rollout, observations, pieces, ent_coef, args)
-
-
-@pytest.mark.parametrize("script", SMALL)
+@pytest.mark.parametrize("script", SCRIPTS)
 def test_presets_and_network_flags_are_flags(script):
     for preset in script.PRESETS:
-        script.parse_args(["--preset", preset])
-    assert set(script.NETWORK_FLAGS) <= set(vars(script.Args()))
+        parse_args(script, "--preset", preset)
+    assert set(script.Memory.flags) <= set(vars(script.Args()))
 
 
 @pytest.mark.parametrize("env_id", ["CueRecall-v0", "MortarMayhemB-Grid-v0", "Endless-MortarMayhem-v0"])
@@ -80,8 +79,8 @@ def test_ratio_is_one_for_every_sample(played, env_id, memory):
 
 @each_memory(MEMORIES)
 def test_ratio_is_nearly_one_in_bfloat16(played, memory):
-    args, run, *_ = played(iterations=3, weights_scale=3.0, env_id="MortarMayhemB-Grid-v0", amp=True, **memory)
-    with ppo_gru.autocast(args, torch.device("cpu")):
+    _, run, *_ = played(iterations=3, weights_scale=3.0, env_id="MortarMayhemB-Grid-v0", amp=True, **memory)
+    with torch.autocast("cpu", torch.bfloat16):
         _, ratio, values = recompute(run)
     assert (ratio - 1).abs().max() < 5e-2
     assert values.dtype == run.rollout.log_probs.dtype == torch.float32
@@ -91,7 +90,7 @@ def test_ratio_is_nearly_one_in_bfloat16(played, memory):
 def test_ratio_error_sees_a_broken_memory(played, memory):
     """Guards the guard: with what the memory stored lost, the ratios are off."""
     _, run, *_ = played(iterations=3, weights_scale=3.0, env_id="CueRecall-v0", **memory)
-    for part in run.rollout.memory_state:
+    for part in vars(run.rollout.memory).values():
         if isinstance(part, torch.Tensor) and part.is_floating_point():
             part.zero_()
     assert (recompute(run)[1] - 1).abs().max() > 1e-4
@@ -104,15 +103,21 @@ def test_bootstrap_value_is_the_next_step_s_value(played, memory):
     torch.testing.assert_close(run.rollout.values[0], last_value, atol=1e-6, rtol=0)
 
 
-@each_memory([memory for memory in RECURRENT if "script" not in memory])
+@each_memory(RECURRENT)
 def test_an_episode_begins_with_an_empty_memory(played, memory):
     rollout = played(env_id="CueRecall-v0", **memory)[1].rollout
     begins = rollout.terminated[:-1]
     assert begins.any()
-    stored = rollout.memory_state.stored
-    assert (stored[1:-1][begins] == 0).all()
-    assert stored[1:-1][~begins].flatten(1).any(1).all(), "and goes on where none ended"
+    stored = rollout.memory.stored
+    assert (stored[1:][begins] == 0).all()
+    assert stored[1:][~begins].flatten(1).any(1).all(), "and goes on where none ended"
     assert (stored[0] == 0).all()
+
+
+def padded_gru(rnn, x, lengths, hidden):
+    """What `packed_gru` replaces: the sequences padded, as on a GPU."""
+    pieces = ppo_gru.Pieces(torch.zeros_like(lengths), lengths, 1)
+    return pieces.unpad(rnn(pieces.pad(x), hidden.transpose(0, 1).contiguous())[0])
 
 
 def gradients(agent):
@@ -124,7 +129,7 @@ def gradients(agent):
 def test_padding_changes_nothing(played, memory, fill, monkeypatch):
     script = memory.get("script", ppo_gru)
     args, run, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
-    run.agent.memory.packed = False  # as on a GPU; packed pieces have no padding
+    monkeypatch.setattr(script, "packed_gru", padded_gru, raising=False)
     rollout = run.rollout
     rollout.advantages, rollout.returns = rollout.rewards - rollout.values, rollout.rewards
 
@@ -132,13 +137,14 @@ def test_padding_changes_nothing(played, memory, fill, monkeypatch):
         pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
         assert pieces.length.min() < pieces.length.max(), "there is padding"
         run.agent.zero_grad()
-        loss, _ = loss_of(script, args, run, pieces)
+        loss, _ = script.ppo_loss(run.agent, rollout, pieces, 1e-3, args)
         loss.backward()
         return recompute(run)[1:], loss.detach(), gradients(run.agent)
 
     clean = learn()
     pad = script.pad_sequence
-    monkeypatch.setattr(script, "pad_sequence", lambda x, batch_first: pad(x, batch_first, padding_value=fill))
+    for module in (script, ppo_gru):  # where Pieces, and where padded_gru's are
+        monkeypatch.setattr(module, "pad_sequence", lambda x, batch_first: pad(x, batch_first, padding_value=fill))
     filled = learn()
     assert filled[1].isfinite(), "padding was multiplied by zero, not masked"
     torch.testing.assert_close(filled[0], clean[0], atol=0, rtol=0)
@@ -157,7 +163,7 @@ def test_no_gradient_crosses_the_end_of_an_episode(played, memory):
     begins = done[:-1].flatten().nonzero()[:, 0] + pieces.num_envs  # flat indices
     assert torch.isin(begins, pieces.first).all(), "a piece begins where an episode begins"
     x = torch.randn(int(pieces.length.sum()), run.agent.encoder.width, requires_grad=True)
-    y = run.agent.memory.unroll(x, pieces, rollout.memory_state)
+    y = run.agent.memory.unroll(rollout.memory, x, pieces)
     ends = pieces.length.cumsum(0)
     piece = int((pieces.length > 2).nonzero()[1, 0])
     first, last = int(ends[piece] - pieces.length[piece]), int(ends[piece] - 1)
@@ -183,12 +189,12 @@ def test_gru_equals_a_loop_over_cells():
 @each_memory(WITH_MEMORY)
 def test_an_episode_s_first_step_is_the_same_whatever_came_before(played, memory):
     _, run, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
-    agent, state = run.agent, run.rollout.memory_state
+    agent, state = run.agent, run.rollout.memory
     obs = {"observation": torch.randn(4, 3)}
     with torch.no_grad():
         fresh = agent.get_value(obs, agent.memory.initial_state(4, 16, torch.device("cpu")))
-        forgotten = agent.memory.reset(state, torch.tensor([True, True, True, False]))
-        values = agent.get_value(obs, forgotten)
+        agent.memory.reset(state, torch.tensor([True, True, True, False]))
+        values = agent.get_value(obs, state)
     torch.testing.assert_close(values[:3], fresh[:3], atol=1e-6, rtol=0)  # else reset has left something
     assert (values[3] - fresh[3]).abs() > 1e-6
 
@@ -197,11 +203,9 @@ def test_an_episode_s_first_step_is_the_same_whatever_came_before(played, memory
 def test_the_encoder_sees_each_step_once_an_epoch_and_no_padding(played, monkeypatch, packed):
     args, run, *_ = played(env_id="CueRecall-v0")
     rows, runs = [], []
-    run.agent.memory.packed = packed
     run.agent.encoder.register_forward_pre_hook(lambda _, inputs: rows.append(len(inputs[0]["observation"])))
-    owner, way = (ppo_gru, "packed_gru") if packed else (run.agent.memory, "recur")
-    unroll = getattr(owner, way)
-    monkeypatch.setattr(owner, way, lambda *given: (runs.append(1), unroll(*given))[1])
+    unroll = ppo_gru.packed_gru if packed else padded_gru
+    monkeypatch.setattr(ppo_gru, "packed_gru", lambda *given: (runs.append(1), unroll(*given))[1])
     ppo_gru.update(run.agent, run.optimizer, run.rollout, 0.0, args)
     assert sum(rows) == args.update_epochs * args.num_envs * args.num_steps
     assert len(runs) == args.update_epochs * args.num_minibatches, "all pieces of a minibatch at once"
@@ -215,21 +219,21 @@ def test_equal_observations_are_encoded_once(played, env_id):
     """The same gradient as from every step's own observation; equal ones are so in all of their parts."""
     args, run, *_ = played(env_id=env_id, num_steps=32, reconstruction_coef=0.1)
     rollout, rows = run.rollout, []
-    unique = ppo_gru.UniqueObservations(rollout.obs, run.agent)
-    obs = [part.flatten(1) for part in unique.obs.values()]
+    rollout.first_occurrence = fast.first_occurrences(rollout.obs)
+    obs = [part.flatten(0, 1).flatten(1) for part in rollout.obs.values()]
     equal = torch.stack([(part[:, None] == part).all(-1) for part in obs]).all(0)  # (B, B)
-    assert torch.equal(unique.first_occurrence, equal.int().argmax(-1))
-    distinct = len(unique.first_occurrence.unique())
-    assert distinct < 0.6 * len(unique.first_occurrence)
+    assert torch.equal(rollout.first_occurrence, equal.int().argmax(-1))
+    distinct = len(rollout.first_occurrence.unique())
+    assert distinct < 0.6 * len(rollout.first_occurrence)
     run.agent.encoder.register_forward_pre_hook(lambda _, inputs: rows.append(len(next(iter(inputs[0].values())))))
     pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
     rollout.advantages, rollout.returns, found = *(2 * (torch.randn(32, 4),)), []
     for _ in range(2):
         run.agent.zero_grad()
-        loss, _ = ppo_gru.ppo_loss(run.agent, rollout, unique, pieces, 1e-3, args)
+        loss, _ = ppo_gru.ppo_loss(run.agent, rollout, pieces, 1e-3, args)
         loss.backward()
         found.append((loss.detach(), gradients(run.agent)))
-        unique.first_occurrence = None
+        rollout.first_occurrence = None
     assert rows == [distinct, 128]
     torch.testing.assert_close(found[0], found[1], atol=1e-6, rtol=1e-4)
 
@@ -249,7 +253,7 @@ def test_a_long_episode_takes_no_more_memory_than_a_short_one(played):
         ppo_gru.collect(run.agent, run.envs, run.rollout, args)
     assert run.envs.episode_lengths[0] > 900
     assert storage() == before
-    assert run.rollout.memory_state.hidden.shape == (1, 1, 4)
+    assert run.rollout.memory.hidden.shape == (1, 1, 4)
 
 
 def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(played):
@@ -257,17 +261,17 @@ def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(pl
     changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"explosion_delay": [1000]}'}
     args, run, *_ = played(script=ppo_trxl, num_envs=1, num_steps=50, num_minibatches=1, **changes)
     # As if the episode had been going on for long; its window is still that of 50 steps.
-    run.rollout.memory_state.episode_step.add_(4050)
+    run.rollout.memory.episode_step.add_(4050)
 
     def storage():
-        state = run.rollout.memory_state
-        return [(part.data_ptr(), part.shape) for part in (state.keys, state.values, state.items, state.item_steps)]
+        state = run.rollout.memory
+        return [(part.data_ptr(), part.shape) for part in (state.keys, state.values, state.hidden, state.stored_step)]
 
     before = storage()
     for _ in range(19):
         ppo_trxl.collect(run.agent, run.envs, run.rollout, args)
         assert recompute(run)[1].sub(1).abs().max() < 1e-5
-    assert run.rollout.memory_state.episode_step > 5000
+    assert run.rollout.memory.episode_step > 5000
     assert storage() == before
 
 
@@ -280,11 +284,11 @@ def test_truncation_bootstraps_with_the_final_observation_and_the_memory_before_
     assert (rollout.truncation_values != 0).equal(rollout.truncated)
     # The same actions played again: the final observation, and the memory that five steps left behind.
     state = run.agent.memory.initial_state(4, 16, torch.device("cpu"))
-    envs = ppo_gru.environments(args, args.num_envs, seed=args.seed)
+    envs = envs_for(args, args.num_envs, seed=args.seed)
     envs.reset()
     with torch.no_grad():
         for t in range(5):
-            *_, state = run.agent.get_action_and_value({"observation": rollout.obs["observation"][t]}, state)
+            run.agent.get_action_and_value({"observation": rollout.obs["observation"][t]}, state)
             *_, infos = envs.step(rollout.actions[t].numpy())
         final = {"observation": torch.from_numpy(np.stack([obs["observation"] for obs in infos["final_obs"]]))}
         value = run.agent.get_value(final, state)
@@ -292,26 +296,27 @@ def test_truncation_bootstraps_with_the_final_observation_and_the_memory_before_
     assert (played(**changes)[1].rollout.truncation_values == 0).all()
 
 
-def test_training_hands_the_rollout_to_gae(tiny, monkeypatch):
+def test_training_hands_the_rollout_to_gae(tiny, opened, monkeypatch):
     args = tiny(env_id="CueRecall-v0", gamma=0.9, gae_lambda=0.8, total_timesteps=64)
-    run = ppo_gru.setup(args)
-    seen, learned = {}, {}
+    run = opened(ppo_gru, args)
+    seen, learned = [], {}
     gae, update = ppo_gru.gae, ppo_gru.update
-    monkeypatch.setattr(ppo_gru, "gae", lambda **given: (seen.update(given), gae(**given))[1])
+    monkeypatch.setattr(ppo_gru, "gae", lambda *given: (seen.extend(given), gae(*given))[1])
     monkeypatch.setattr(ppo_gru, "update", lambda *given: (learned.update(vars(given[2])), update(*given))[1])
     ppo_gru.train(args, run)
+    rewards, values, _, *ends, gamma, gae_lambda = seen
     names = ("rewards", "values", "terminated", "truncated", "truncation_values")
-    assert all(seen[name] is getattr(run.rollout, name) for name in names)
-    assert (seen["gamma"], seen["gae_lambda"]) == (0.9, 0.8)
-    assert learned["advantages"].equal(gae(**seen))
-    assert learned["returns"].equal(gae(**seen) + run.rollout.values)
+    for name, part in zip(names, (rewards, values, *ends), strict=True):
+        assert part is getattr(run.rollout, name)
+    assert (gamma, gae_lambda) == (0.9, 0.8)
+    assert learned["advantages"].equal(gae(*seen))
+    assert learned["returns"].equal(gae(*seen) + run.rollout.values)
 
 
 @pytest.mark.parametrize("layers", [1, 2])
 def test_the_packed_gru_learns_as_the_library_s(layers):
     gru, found = nn.GRU(5, 5, layers, batch_first=True).double(), []
     lengths = [3, 9, 1, 9, 4]
-    pieces = ppo_gru.Pieces(torch.zeros(5, dtype=torch.int64), torch.tensor(lengths), 1)
     for ours in (True, False):
         generator = torch.Generator().manual_seed(3)
         shapes = [(sum(lengths), 5), (5, layers, 5), (sum(lengths), 5)]
@@ -320,7 +325,7 @@ def test_the_packed_gru_learns_as_the_library_s(layers):
         )
         gru.zero_grad()
         if ours:
-            y = ppo_gru.packed_gru(gru, x, pieces, hidden)
+            y = fast.packed_gru(gru, x, torch.tensor(lengths), hidden)
         else:
             packed = nn.utils.rnn.pack_sequence(x.split(lengths), enforce_sorted=False)
             y = torch.cat(nn.utils.rnn.unpack_sequence(gru(packed, hidden.transpose(0, 1).contiguous())[0]))
@@ -330,10 +335,10 @@ def test_the_packed_gru_learns_as_the_library_s(layers):
         torch.testing.assert_close(got, want, rtol=0, atol=1e-12)
 
 
-def test_packed_or_padded_is_the_same(played):
+def test_packed_or_padded_is_the_same(played, monkeypatch):
     _, run, *_ = played(iterations=2, env_id="CueRecall-v0", num_layers=2)
     packed = recompute(run)
-    run.agent.memory.packed = False
+    monkeypatch.setattr(ppo_gru, "packed_gru", padded_gru)
     for got, want in zip(packed, recompute(run), strict=True):
         torch.testing.assert_close(got, want, rtol=0, atol=1e-6)
 
@@ -356,26 +361,24 @@ def test_acting_and_learning_ask_no_device_for_numbers(played, monkeypatch, memo
     args, run, *_ = played(env_id="MortarMayhemB-Grid-v0", iterations=2, **heads, **memory)
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())  # knows no such device
     pieces, agent = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated), run.agent.to("meta")
-    on_cpu = {"episode_step", "item_steps"}  # of the transformer's memory: what shapes depend on
+    on_cpu = {"episode_step", "stored_step"}  # of the transformer's memory: what shapes depend on
 
-    def moved(part):
-        return part.to("meta") if isinstance(part, torch.Tensor) else part
+    def moved(parts):
+        return {k: v.to("meta") if isinstance(v, torch.Tensor) and k not in on_cpu else v for k, v in parts.items()}
 
-    state = run.rollout.memory_state
-    state = state._replace(**{name: moved(part) for name, part in state._asdict().items() if name not in on_cpu})
-    parts = {name: moved(part) for name, part in vars(run.rollout).items()}
-    rollout = script.Rollout(
-        **parts | {"obs": {k: v.to("meta") for k, v in run.rollout.obs.items()}, "memory_state": state}
-    )
+    rollout = run.rollout
+    memory = type(rollout.memory)(**moved(vars(rollout.memory)))
+    rollout = script.Rollout(**moved(vars(rollout)) | {"obs": moved(rollout.obs), "memory": memory})
     obs = {name: part[0] for name, part in rollout.obs.items()}
     with NoQuestions(), torch.no_grad():
-        state = agent.memory.begin_rollout(state)
-        *_, state = agent.get_action_and_value(obs, state)
-        agent.get_value(obs, state)
-    observations, optimizer = script.UniqueObservations(rollout.obs, agent), torch.optim.SGD(agent.parameters())
+        agent.memory.begin_rollout(memory, agent.memory.carry(memory))
+        agent.get_action_and_value(obs, memory)
+        agent.get_value(obs, memory)
+    optimizer = torch.optim.SGD(agent.parameters())
+    assert fast.first_occurrences(rollout.obs) is None
     for minibatch in pieces.minibatches(2):
         with NoQuestions():
-            loss, _ = script.ppo_loss(agent, rollout, observations, minibatch, 1e-3, args)
+            loss, _ = script.ppo_loss(agent, rollout, minibatch, 1e-3, args)
             loss.backward()
             torch.nn.utils.clip_grad_norm_(agent.parameters(), 1.0)
             optimizer.step()
@@ -386,11 +389,11 @@ def test_acting_and_learning_ask_no_device_for_numbers(played, monkeypatch, memo
 @each_memory(MEMORIES)
 def test_refreshing_with_the_weights_that_acted_changes_nothing(played, env_id, memory):
     args, run, *_ = played(iterations=3, env_id=env_id, **memory)
-    before = [part.clone() if isinstance(part, torch.Tensor) else part for part in run.rollout.memory_state]
+    before = copy.deepcopy(vars(run.rollout.memory))
     memory.get("script", ppo_gru).refresh_memory(run.agent, run.rollout, args)
-    for name, was, now in zip(run.rollout.memory_state._fields, before, run.rollout.memory_state, strict=True):
-        same = torch.equal(was, now) if isinstance(was, torch.Tensor) else was == now
-        assert same, f"{name}: does rewind go back to the first step, and does step leave the state that it is given?"
+    for name, now in vars(run.rollout.memory).items():
+        same = torch.equal(before[name], now) if isinstance(now, torch.Tensor) else before[name] == now
+        assert same, f"{name}: does carry hold all that a rollout begins with?"
 
 
 @each_memory(WITH_MEMORY)
@@ -399,8 +402,7 @@ def test_a_refreshed_memory_is_that_of_a_rollout_with_the_present_weights(played
     script = memory.get("script", ppo_gru)
     args, run, *_ = played(iterations=3, weights_scale=3.0, env_id="CueRecall-v0", **memory)
     rollout, agent = run.rollout, run.agent
-    state = rollout.memory_state
-    state = type(state)(*(part.clone() if isinstance(part, torch.Tensor) else part for part in state))
+    state = copy.deepcopy(rollout.memory)
     with torch.no_grad():
         for parameter in agent.parameters():
             parameter.mul_(0.9)
@@ -409,18 +411,17 @@ def test_a_refreshed_memory_is_that_of_a_rollout_with_the_present_weights(played
     assert not torch.allclose(ratio, torch.ones(()), atol=1e-4), "the policy is another one"
     # Steps one by one, from what was stored before the rollout.
     with torch.no_grad():
-        state, wanted = agent.memory.begin_rollout(agent.memory.rewind(state)), []
+        agent.memory.begin_rollout(state, rollout.carry)
+        wanted = []
         for t in range(args.num_steps):
-            _, _, value, state = agent.get_action_and_value(
-                {name: part[t] for name, part in rollout.obs.items()}, state
-            )
+            _, _, value = agent.get_action_and_value({name: part[t] for name, part in rollout.obs.items()}, state)
             wanted.append(value)
-            state = agent.memory.reset(state, rollout.terminated[t] | rollout.truncated[t])
+            agent.memory.reset(state, rollout.terminated[t] | rollout.truncated[t])
     index, _, values = recompute(run)
     torch.testing.assert_close(values, torch.stack(wanted).flatten()[index], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
+@pytest.mark.parametrize("script", SCRIPTS)
 def test_memory_is_refreshed_before_every_epoch_but_the_first(tiny, script, monkeypatch):
     calls, refresh_memory, ppo_loss = [], script.refresh_memory, script.ppo_loss
     monkeypatch.setattr(script, "refresh_memory", lambda *given: calls.append("r") or refresh_memory(*given))
@@ -441,13 +442,13 @@ def test_memory_is_refreshed_before_every_epoch_but_the_first(tiny, script, monk
         (True, ppo_trxl, {"trxl_memory_gradient": True, "trxl_segment_length": 3}),
     ],
 )
-def test_which_updates_read_refreshed_memory(tiny, reads, script, changes):
+def test_which_updates_read_refreshed_memory(tiny, opened, reads, script, changes):
     """As docs/memory.md says: the first update is another one where it reads what was refreshed."""
     changes |= {"env_id": "Endless-MortarMayhem-v0", "obs_type": "vector", "total_timesteps": 64, "init_lr": 1e-2}
     weights = []
     for refresh in (False, True):
         args = tiny(script, refresh_memory=refresh, num_minibatches=1, **changes)
-        run = script.setup(args)
-        script.run_to_end(args, run)
+        run = opened(script, args)
+        script.train(args, run)
         weights.append(torch.cat([weight.flatten() for weight in run.agent.state_dict().values()]))
     assert weights[0].equal(weights[1]) == (not reads)

@@ -7,7 +7,8 @@ import torch
 
 import ppo_gru
 import ppo_trxl
-from ppo_gru import Agent, Args, AtariCNN, UniqueObservations, in_chunks
+from ppo_gru import Agent, Args, AtariCNN
+from ppo_utils import fast
 
 PICTURE = gym.spaces.Box(0, 255, (84, 84, 3), np.uint8)
 PIXELS = gym.spaces.Dict(observation=PICTURE)
@@ -89,8 +90,8 @@ def test_chunks_do_not_change_the_features(monkeypatch):
     cnn, pixels = AtariCNN(3), torch.randint(0, 256, (10, 84, 84, 3), dtype=torch.uint8)
     whole, sizes = cnn(pixels), []
     cnn.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
-    monkeypatch.setattr(ppo_gru, "CHUNK", 3)
-    torch.testing.assert_close(in_chunks(cnn, pixels), whole)
+    monkeypatch.setattr(fast, "CHUNK", 3)
+    torch.testing.assert_close(fast.in_chunks(cnn, pixels), whole)
     assert sizes == [3, 3, 3, 1]
 
 
@@ -98,12 +99,12 @@ def test_batches_are_rounded_up_in_bfloat16_which_changes_nothing():
     torch.manual_seed(0)
     agent = Agent(PIXELS, [4], Args(hidden_size=32, head_size=32))
     pixels = torch.randint(0, 256, (16, 1, 84, 84, 3), dtype=torch.uint8)
-    observations, sizes, found = UniqueObservations({"observation": pixels}, agent), [], []
+    obs, sizes, found = {"observation": pixels}, [], []
     agent.encoder.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0]["observation"])))
     for count in (5, 16):
         agent.zero_grad()
         with torch.autocast("cpu", torch.bfloat16):
-            x = observations.encode(agent.encoder, torch.arange(count))
+            x = fast.encode(agent.encoder, obs, torch.arange(count), fast.first_occurrences(obs))
         assert len(x) == count
         x[:5].square().sum().backward()
         found.append([x[:5], *(parameter.grad for parameter in agent.encoder.parameters())])

@@ -12,9 +12,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from conftest import parse_args
 
 import ppo_gru
 import ppo_trxl
+from ppo_utils import processes
+from ppo_utils.checkpoints import read_checkpoint, read_model
 
 SCRIPTS = [ppo_gru, ppo_trxl]
 GRID = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector"}
@@ -22,25 +25,24 @@ WIDTH = {ppo_gru: "--hidden-size 16", ppo_trxl: "--trxl-dim 16 --trxl-memory-len
 ONE_UPDATE = """
 import importlib, sys
 import torch
+from ppo_utils.processes import rank_and_size
+from ppo_utils.runs import close
 script = importlib.import_module(sys.argv[1])
 args, weights, rollout = torch.load("given.pt", weights_only=False)
 run = script.setup(args)
-rank, processes = script.rank_and_size()
+rank, processes = rank_and_size()
 run.agent.load_state_dict(weights)
 lanes = torch.arange(args.num_envs).chunk(processes)[rank]
 for name, stored in rollout.items():
     # Two processes, 16 lanes each: lanes are the second axis of a rollout, but for the transformer's cache.
     setattr(run.rollout, name, stored[:, lanes] if isinstance(stored, torch.Tensor) else stored)
 run.rollout.obs = {name: part[:, lanes] for name, part in rollout["obs"].items()}
-memory = rollout["memory_state"]
-own = {"stored": memory[-1][:, lanes]} if script.__name__ == "ppo_gru" else {
-    "items": memory.items[:, lanes], "item_steps": memory.item_steps[:, lanes]
-}
-run.rollout.memory_state = memory._replace(**own)
+for name in ("stored",) if script.__name__ == "ppo_gru" else ("hidden", "stored_step"):
+    setattr(run.rollout.memory, name, getattr(rollout["memory"], name)[:, lanes])
 optimizer = torch.optim.SGD(run.agent.parameters(), lr=1.0)
-logs = script.update(run.agent, optimizer, run.rollout, 0.01, args)
+logs = script.mean_logs(script.update(run.agent, optimizer, run.rollout, 0.01, args), run.rollout)
 torch.save((run.agent.state_dict(), logs), f"updated{rank}.pt")
-script.close(run)
+close(run)
 """
 
 
@@ -56,14 +58,14 @@ def flags_of(script, **changes):
 
 @pytest.mark.parametrize("obs_type", ["vector", "pixels"])
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_two_processes_make_the_update_of_one(tiny, script, obs_type):
+def test_two_processes_make_the_update_of_one(tiny, opened, script, obs_type):
     """Given the same rollouts, each half of the lanes; one gradient step.
 
     By plain gradient descent: AdamW divides a gradient by its size, also where that is no more than rounding.
     """
     changes = {"num_envs": 32, "num_minibatches": 1, "update_epochs": 1, "num_steps": 16}
     args = tiny(script, **GRID | {"obs_type": obs_type}, **changes, total_timesteps=512)
-    run = script.setup(args)
+    run = opened(script, args)
     for _ in range(2):
         script.collect(run.agent, run.envs, run.rollout, args)
     rollout = run.rollout
@@ -72,7 +74,8 @@ def test_two_processes_make_the_update_of_one(tiny, script, obs_type):
     given = {field.name: getattr(rollout, field.name) for field in dataclasses.fields(rollout)}
     weights = {name: weight.clone() for name, weight in run.agent.state_dict().items()}
     torch.save((args, weights, given), "given.pt")
-    alone = script.update(run.agent, torch.optim.SGD(run.agent.parameters(), lr=1.0), rollout, 0.01, args)
+    optimizer = torch.optim.SGD(run.agent.parameters(), lr=1.0)
+    alone = script.mean_logs(script.update(run.agent, optimizer, rollout, 0.01, args), rollout)
 
     Path("program.py").write_text(ONE_UPDATE)
     environment = {**os.environ, "PYTHONPATH": os.path.dirname(script.__file__)}
@@ -86,15 +89,16 @@ def test_two_processes_make_the_update_of_one(tiny, script, obs_type):
 
 
 @pytest.mark.parametrize("obs_type", ["vector", "pixels"])
-def test_gradients_are_means_over_steps(monkeypatch, tiny, obs_type):
+def test_gradients_are_means_over_steps(monkeypatch, tiny, opened, obs_type):
     """Of 3 steps here and 1 step there, not of two halves; in memory as the weights, which fused AdamW relies on."""
-    run = ppo_gru.setup(tiny(**GRID | {"obs_type": obs_type}))
+    run = opened(ppo_gru, tiny(**GRID | {"obs_type": obs_type}))
     for parameter in run.agent.parameters():
         parameter.grad = torch.full_like(parameter, 4.0)
-    monkeypatch.setattr(ppo_gru.dist, "is_initialized", lambda: True)
-    monkeypatch.setattr(ppo_gru.dist, "all_reduce", lambda flat: flat.add_(torch.full_like(flat, 8.0).index_fill_(
+    monkeypatch.setattr(processes.dist, "is_initialized", lambda: True)
+    monkeypatch.setattr(processes.dist, "all_reduce", lambda flat: flat.add_(torch.full_like(flat, 8.0).index_fill_(
         0, torch.tensor([len(flat) - 1]), 1.0)))  # fmt: skip
-    ppo_gru.average_gradients(run.agent, 3)
+    processes.average_gradients(run.agent, 3)
+    monkeypatch.undo()
     for parameter in run.agent.parameters():
         assert (parameter.grad == (3 * 4.0 + 8.0) / 4).all()
         assert parameter.grad.shape == parameter.shape
@@ -108,7 +112,8 @@ def test_no_thread_of_the_group_outlives_the_training(script):
 import sys
 from pathlib import Path
 import {script.__name__} as script
-script.main(script.parse_args(sys.argv[1:]))
+from ppo_utils.runs import parse_args
+script.main(parse_args(script.Args, script.PRESETS, sys.argv[1:]))
 print([name for task in Path("/proc/self/task").iterdir() if "gloo" in (name := (task / "comm").read_text())])
 """)
     line = torchrun("threads.py", *flags_of(script), "--total-timesteps", "128")
@@ -118,14 +123,15 @@ print([name for task in Path("/proc/self/task").iterdir() if "gloo" in (name := 
 
 
 def test_a_maximum_is_the_maximum_of_all_processes():
-    logs = [{"charts/memory_window": 40.0, "losses/loss": 1.0}, {"charts/memory_window": 100.0, "losses/loss": 2.0}]
-    combined, *_ = ppo_trxl.combine_processes([(each, {}, 0) for each in logs])
-    assert combined == {"charts/memory_window": 100.0, "losses/loss": 1.5}
+    logs = [{"losses/ratio_error": 40.0, "losses/loss": 1.0}, {"losses/ratio_error": 100.0, "losses/loss": 2.0}]
+    combined, episodes = processes.combine_logs([(logs[0], {"a": [1.0]}), (logs[1], {"a": [2.0], "b": [3.0]})])
+    assert combined == {"losses/ratio_error": 100.0, "losses/loss": 1.5}
+    assert episodes == {"a": [1.0, 2.0], "b": [3.0]}
 
 
 def test_a_resumed_run_is_the_unstopped_one(curves):
     script = ppo_trxl
-    extra = {"eval-interval": 2, "eval-levels": 2, "eval-repeats": 1, "target-kl": 5e-6, "checkpoint-interval": 3}
+    extra = {"eval-interval": 2, "eval-levels": 2, "target-kl": 5e-6, "checkpoint-interval": 3}
     flags = flags_of(script, **extra)
     subprocess.run(torchrun(script.__file__, *flags, "--exp-name", "whole"), check=True, timeout=300)
     half = [*flags, "--total-timesteps", "192", "--exp-name", "half"]
@@ -133,7 +139,7 @@ def test_a_resumed_run_is_the_unstopped_one(curves):
     (whole,), (half,) = (list(Path("runs").glob(f"*{name}*")) for name in ("whole", "half"))
     more = ["--resume", str(half), "--total-timesteps", "384"]
     with pytest.raises(ValueError, match="this run has 2 processes, not 1; start as many"):
-        script.setup(script.parse_args(more))
+        script.setup(parse_args(script, *more))
     subprocess.run(torchrun(script.__file__, *more), check=True, timeout=300)
     before, after = curves(whole), curves(half)
     assert {step for step, _ in before["losses/loss"]} == {64, 128, 192, 256, 320, 384}
@@ -144,16 +150,16 @@ def test_a_resumed_run_is_the_unstopped_one(curves):
         name: points for name, points in before.items() if "eval" not in name
     }
     assert after["eval_levels/return"] == before["eval_levels/return"]
-    processes = script.read_model(half / "checkpoint-384.pt")["processes"]
-    assert len(processes) == 2
-    assert not processes[0]["torch"].equal(processes[1]["torch"]), "they choose other actions"
+    states = read_model(half / "checkpoint-384.pt")["processes"]
+    assert len(states) == 2
+    assert not states[0]["torch"].equal(states[1]["torch"]), "they choose other actions"
 
 
-def started(command, file="checkpoint-*.pt"):
-    """Start a training and wait for its first file of this name; return the process."""
+def started(command):
+    """Start a training and wait for its first checkpoint; return the process."""
     process = subprocess.Popen(torchrun(*command), stderr=subprocess.PIPE, text=True, start_new_session=True)
     deadline = time.monotonic() + 200
-    while not list(Path("runs").glob(f"*/{file}")):
+    while not list(Path("runs").glob("*/checkpoint-*.pt")):
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.1)
@@ -178,7 +184,7 @@ def test_a_process_that_dies_ends_the_others(rank):
     assert process.returncode != 0
     assert "exitcode  : -9" in said, "torchrun says which one ended"
     (folder,) = Path("runs").iterdir()
-    assert ppo_gru.read_checkpoint(folder)["step"] > 0
+    assert read_checkpoint(folder)["step"] > 0
     message = r"ppo_gru\.py: iteration \d+: another process of this run has ended; .*; the last checkpoint is \S+\.pt"
     assert re.search(message, said), said
 
@@ -186,9 +192,9 @@ def test_a_process_that_dies_ends_the_others(rank):
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the processes in /proc")
 def test_a_signal_to_torchrun(curves):
     """As a cluster sends it: to torchrun, which passes it on, and perhaps to all processes too."""
-    keep = {"checkpoint-interval": 10**6, "keep-models": 10**6}  # the latter tells when training has begun
-    command = [ppo_gru.__file__, *flags_of(ppo_gru, **{"total-timesteps": 10**8, **keep})]
-    process = started(command, "model-*.pt")
+    # Its first checkpoint tells that training has begun.
+    command = [ppo_gru.__file__, *flags_of(ppo_gru, **{"total-timesteps": 10**8, "checkpoint-interval": 1})]
+    process = started(command)
     deadline = threading.Timer(100, process.kill)
     deadline.start()
     for each in [*workers(process), process.pid]:
@@ -199,7 +205,7 @@ def test_a_signal_to_torchrun(curves):
     assert "another process of this run has ended" not in said
     assert "stopping at the end of this iteration" in said
     (folder,) = Path("runs").iterdir()
-    assert ppo_gru.read_checkpoint(folder)["step"] == curves(folder)["losses/loss"][-1][0]
+    assert read_checkpoint(folder)["step"] == curves(folder)["losses/loss"][-1][0]
 
 
 def test_environments_that_cannot_be_split():

@@ -10,17 +10,21 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from conftest import SCRIPTS, parse_args
 
 import enjoy
 import evaluate
 import ppo_gru
 import ppo_trxl
+from ppo_utils import runs
+from ppo_utils.checkpoints import model_of, read_checkpoint, read_model, write_file
+from ppo_utils.processes import RunError
 
-SCRIPTS = [ppo_gru, ppo_trxl]
 GRID = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector"}
 ENDLESS = {"env_id": "Endless-SearingSpotlights-v0", "obs_type": "vector"}
 RUNS = {
@@ -33,7 +37,7 @@ RUNS = {
     "no memory, stack": {**GRID, "memory": "none", "frame_stack": 3, "step_encoding": True, "norm_adv": "batch"},
     "GRU, ground truth": {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "ground_truth_coef": 0.1},
     "GRU, probe": {**GRID, "ground_truth_coef": 0.1, "ground_truth_detach": True, "observe_last_action": True},
-    "GRU, evaluations": {**GRID, "eval_interval": 2, "eval_levels": 3, "eval_repeats": 2},
+    "GRU, evaluations": {**GRID, "eval_interval": 2, "eval_levels": 2},
     "GRU, truncated": {
         "env_id": "SearingSpotlights-v0", "env_options": '{"max_steps": 9}', "bootstrap_truncated": True
     },
@@ -54,7 +58,7 @@ RUNS = {
     "TrXL, no encoding": {"script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "none"},
     "GTrXL, pixels, evaluations": {
         "script": ppo_trxl, "env_id": "MortarMayhem-Grid-v0", "trxl_gate": "gru", "eval_interval": 1, "eval_levels": 1,
-        "eval_repeats": 2, "eval_max_steps": 30,
+        "eval_max_steps": 30,
     },
     "TrXL, both heads": {
         "script": ppo_trxl, "env_id": "SearingSpotlights-v0", "ground_truth_coef": 0.1, "reconstruction_coef": 0.1,
@@ -82,9 +86,9 @@ def interrupted(monkeypatch, script, args, iteration):
     with monkeypatch.context() as patch:
         stop_after(patch, script, iteration)
         run = script.setup(args)
-        script.stop_on_signals(run)
+        runs.stop_on_signals(run)
         try:
-            script.run_to_end(args, run)
+            runs.run_to_end(args, run, script.train)
         finally:
             for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
                 signal.signal(number, handler)
@@ -94,7 +98,7 @@ def interrupted(monkeypatch, script, args, iteration):
 
 
 def resumed(script, folder, *flags):
-    return script.main(script.parse_args(["--resume", str(folder), *flags]))
+    return script.main(parse_args(script, "--resume", str(folder), *flags))
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -128,7 +132,7 @@ def test_a_longer_training_goes_on_where_the_shorter_one_ended(tiny, curves, scr
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_what_was_played_twice_is_logged_once(tiny, curves, monkeypatch, script):
     """A crash after the checkpoint: an iteration and its evaluation are done again."""
-    few = {"eval_interval": 1, "eval_levels": 2, "eval_repeats": 1, "keep_models": 6}
+    few = {"eval_interval": 1, "eval_levels": 2}
     args = tiny(script, **GRID, total_timesteps=6 * 64, checkpoint_interval=2, **few)
     whole = curves(script.main(args))
     with monkeypatch.context() as patch:
@@ -143,15 +147,13 @@ def test_what_was_played_twice_is_logged_once(tiny, curves, monkeypatch, script)
         patch.setattr(script, "update", crash)
         run = script.setup(args)
         with pytest.raises(RuntimeError, match="crash"):
-            script.run_to_end(args, run)
+            runs.run_to_end(args, run, script.train)
     assert curves(run.folder)["losses/loss"] == whole["losses/loss"][:3]
     assert resumed(script, run.folder) == run.folder
     assert curves(run.folder) == whole
     steps, scores = evaluate.read_run(str(run.folder)).curves["eval/return"]
     assert steps.tolist() == [64, 128, 192, 256, 320, 384]
-    assert scores.shape == (6, 2, 1), "each level's"
-    found = sorted(int(path.stem.partition("-")[2]) for path in run.folder.glob("model-*.pt"))
-    assert found == [64, 128, 192, 256, 320, 384]
+    assert scores.shape == (6, 2, 3), "each level's"
 
 
 def test_copies_of_a_checkpoint_are_left_alone(tiny):
@@ -159,31 +161,30 @@ def test_copies_of_a_checkpoint_are_left_alone(tiny):
     for name in ("checkpoint-128-good.pt", "checkpoint-128 (copy).pt", "checkpoint-best.pt"):
         (folder / name).write_bytes((folder / "checkpoint-128.pt").read_bytes())
     resumed(ppo_gru, folder, "--total-timesteps", "512")
-    assert ppo_gru.read_checkpoint(folder)["step"] == 512
+    assert read_checkpoint(folder)["step"] == 512
     assert len(list(folder.glob("checkpoint-128*"))) == 3
 
 
-def test_a_run_that_is_being_trained(tiny):
-    run = ppo_gru.setup(tiny(**GRID, total_timesteps=256, checkpoint_interval=1))
+def test_a_run_that_is_being_trained(tiny, opened):
+    args = tiny(**GRID, total_timesteps=256, checkpoint_interval=1)
+    run = opened(ppo_gru, args)
     ppo_gru.train(tiny(**GRID, checkpoint_interval=1), run)
     with pytest.raises(OSError, match=r"--resume .*: another process is training this run"):
-        ppo_gru.setup(ppo_gru.parse_args(["--resume", str(run.folder)]))
-    ppo_gru.close(run)
+        ppo_gru.setup(parse_args(ppo_gru, "--resume", str(run.folder)))
+    runs.close(run)
     assert resumed(ppo_gru, run.folder) == run.folder
 
 
 def test_which_files_are_kept(tiny):
-    folder = ppo_gru.main(tiny(**GRID, total_timesteps=10 * 64, checkpoint_interval=3, keep_models=3))
-    assert sorted(path.name for path in folder.glob("*.pt")) == [
-        "checkpoint-576.pt", "checkpoint-640.pt", "model-256.pt", "model-448.pt", "model-640.pt"
-    ]  # fmt: skip
-    assert ppo_gru.read_model(folder / "model-256.pt")["step"] == 256
+    folder = ppo_gru.main(tiny(**GRID, total_timesteps=10 * 64, checkpoint_interval=3))
+    assert sorted(path.name for path in folder.glob("*.pt")) == ["checkpoint-576.pt", "checkpoint-640.pt"]
+    assert read_model(folder / "checkpoint-576.pt")["step"] == 576
     folder = ppo_gru.main(tiny(**GRID, checkpoint_interval=0, exp_name="none"))
     assert not list(folder.glob("*.pt"))
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_a_checkpoint_is_a_model_too(tiny, script):
+def test_a_checkpoint_is_a_model_too(tiny, opened, script):
     args = tiny(script, **GRID, num_levels=50, save_model=True)
     folder = script.main(args)
     model, checkpoint = folder / "model.pt", folder / "checkpoint-128.pt"
@@ -194,23 +195,23 @@ def test_a_checkpoint_is_a_model_too(tiny, script):
     assert scores[0][0]["agents"][0]["metrics"] == scores[1][0]["agents"][0]["metrics"]
     enjoy.main(enjoy.Config(checkpoint=str(checkpoint), out="page.html", max_steps=5))
     assert os.path.getsize("page.html") > 1000
-    run = script.setup(tiny(script, **GRID, load_model=str(checkpoint), exp_name="again"))
-    for name, weight in script.read_model(model)["weights"].items():
+    run = opened(script, tiny(script, **GRID, load_model=str(checkpoint), exp_name="again"))
+    for name, weight in read_model(model)["weights"].items():
         assert run.agent.state_dict()[name].equal(weight)
     assert run.step == 0
 
 
-def test_environments_of_other_packages_begin_new_episodes(tiny, curves, monkeypatch, capfd):
+def test_environments_of_other_packages_begin_new_episodes(tiny, opened, curves, monkeypatch, capfd):
     args = tiny(env_id="CartPole-v1", total_timesteps=5 * 64)
     folder = interrupted(monkeypatch, ppo_gru, args, 2)
     capfd.readouterr()
-    run = ppo_gru.setup(ppo_gru.parse_args(["--resume", str(folder)]))
+    run = opened(ppo_gru, parse_args(ppo_gru, "--resume", str(folder)))
     assert "CartPole-v1 has no state to save: every environment begins a new episode" in capfd.readouterr().err
-    first = ppo_gru.setup(tiny(env_id="CartPole-v1", exp_name="first"))
+    first = opened(ppo_gru, tiny(env_id="CartPole-v1", exp_name="first"))
     for name, part in run.rollout.next_obs.items():
         assert not (part == first.rollout.next_obs[name]).all(axis=1).any(), "not the episodes that it began with"
-    assert not run.rollout.memory_state.hidden.any()
-    ppo_gru.run_to_end(args, run)
+    assert not run.rollout.memory.hidden.any()
+    runs.run_to_end(args, run, ppo_gru.train)
     assert [step for step, _ in curves(folder)["losses/loss"]] == [64, 128, 192, 256, 320]
 
 
@@ -226,11 +227,11 @@ def test_videos_go_on(tiny, monkeypatch):
     assert list(folder.glob("videos-128/*.mp4")), "what is there already is never written over"
 
 
-def test_a_second_interrupt_ends_the_training_at_once(tiny, monkeypatch):
-    run = ppo_gru.setup(tiny(**GRID))
+def test_a_second_interrupt_ends_the_training_at_once(tiny, opened, monkeypatch):
+    run = opened(ppo_gru, tiny(**GRID))
     handlers = {}
-    monkeypatch.setattr(ppo_gru.signal, "signal", handlers.__setitem__)
-    ppo_gru.stop_on_signals(run)
+    monkeypatch.setattr(runs.signal, "signal", handlers.__setitem__)
+    runs.stop_on_signals(run)
     handlers[signal.SIGTERM](signal.SIGTERM, None)
     handlers[signal.SIGTERM](signal.SIGTERM, None)  # whoever sends it twice does not mean more by it
     assert run.received_signal == signal.SIGTERM
@@ -256,12 +257,12 @@ def test_a_signal_to_the_command(tiny, curves, tmp_path, number):
     assert "Traceback" not in said
     (folder,) = tmp_path.glob("runs/*")
     (checkpoint,) = folder.glob("checkpoint-*.pt")
-    assert ppo_gru.read_model(checkpoint)["step"] == ppo_gru.read_model(folder / "model.pt")["step"] < 6400
+    assert read_model(checkpoint)["step"] == read_model(folder / "model.pt")["step"] < 6400
     done = subprocess.run(
         [sys.executable, ppo_gru.__file__, "--resume", str(folder)], cwd=tmp_path, stderr=subprocess.PIPE, timeout=300
     )
     assert done.returncode == 0, done.stderr
-    assert curves(folder) == curves(ppo_gru.main(ppo_gru.parse_args(flags)))
+    assert curves(folder) == curves(ppo_gru.main(parse_args(ppo_gru, *flags)))
 
 
 CONTRADICTIONS = {
@@ -302,7 +303,7 @@ def test_flags_that_repeat_the_run_s_are_no_contradiction(trained):
 
 def test_another_script_s_run(trained):
     with pytest.raises(ValueError, match=r"this run is ppo_gru\.py's, not ppo_trxl\.py's"):
-        ppo_trxl.setup(ppo_trxl.parse_args(["--resume", str(trained), "--num-minibatches", "1000"]))
+        ppo_trxl.setup(parse_args(ppo_trxl, "--resume", str(trained), "--num-minibatches", "1000"))
 
 
 def test_a_checkpoint_that_is_cut_short(trained, tmp_path):
@@ -322,7 +323,7 @@ def test_a_checkpoint_that_is_cut_short(trained, tmp_path):
 
 def test_a_folder_without_a_checkpoint(tmp_path):
     with pytest.raises(OSError, match=r"--resume nowhere: there is no checkpoint-STEP\.pt in this folder"):
-        ppo_gru.parse_args(["--resume", "nowhere"])
+        parse_args(ppo_gru, "--resume", "nowhere")
 
 
 def test_a_folder_that_cannot_be_written(trained, monkeypatch):
@@ -333,7 +334,7 @@ def test_a_folder_that_cannot_be_written(trained, monkeypatch):
 
 def test_a_checkpoint_with_the_weights_in_another_order(trained):
     path = trained / "checkpoint-128.pt"
-    saved = ppo_gru.read_model(path)
+    saved = read_model(path)
     moments = saved["optimizer"]["state"]
     saved["optimizer"]["state"] = {i: moments[(i + 1) % len(moments)] for i in moments}
     torch.save(saved, path)
@@ -342,8 +343,8 @@ def test_a_checkpoint_with_the_weights_in_another_order(trained):
 
 
 def test_weights_alone_are_no_checkpoint(trained):
-    torch.save(ppo_gru.read_model(trained / "checkpoint-128.pt") | {"processes": None}, trained / "checkpoint-128.pt")
-    saved = ppo_gru.read_model(trained / "checkpoint-128.pt")
+    torch.save(read_model(trained / "checkpoint-128.pt") | {"processes": None}, trained / "checkpoint-128.pt")
+    saved = read_model(trained / "checkpoint-128.pt")
     del saved["processes"]
     torch.save(saved, trained / "checkpoint-128.pt")
     with pytest.raises(ValueError, match="its last checkpoint holds weights alone; --load-model takes these"):
@@ -353,7 +354,7 @@ def test_weights_alone_are_no_checkpoint(trained):
 def test_a_checkpoint_whose_arguments_were_changed(trained):
     """Another network, and other environments, than the rest of the file is of."""
     path = trained / "checkpoint-128.pt"
-    saved = ppo_gru.read_model(path)
+    saved = read_model(path)
     torch.save({**saved, "args": saved["args"] | {"hidden_size": 64}}, path)
     with pytest.raises(ValueError, match="holds the weights of another network"):
         resumed(ppo_gru, trained)
@@ -400,39 +401,38 @@ def test_no_room_for_curves():
     assert re.fullmatch(said, line), line
 
 
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_no_room_for_an_evaluation(tiny, monkeypatch, script):
+def test_no_room_for_an_evaluation(tiny, monkeypatch):
     """A defect of the disk that TensorBoard's thread found before is raised by whatever is logged next."""
-    args = tiny(script, env_id="CueRecall-v0", eval_interval=1, eval_levels=2, save_model=True)
-    run = script.setup(args)
+    args = tiny(env_id="CueRecall-v0", eval_interval=1, eval_levels=2, save_model=True)
+    run = ppo_gru.setup(args)
 
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(run.writer, "add_tensor", full)
     message = r"iteration 1: cannot write to .* \(No space left on device\); there is no checkpoint yet"
-    with pytest.raises(script.RunError, match=message):
-        script.run_to_end(args, run)
+    with pytest.raises(RunError, match=message):
+        runs.run_to_end(args, run, ppo_gru.train)
     assert not (run.folder / "model.pt").exists()
 
 
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_a_disk_that_became_read_only(tiny, monkeypatch, script):
-    run = script.setup(tiny(script, env_id="CueRecall-v0"))
+def test_a_disk_that_became_read_only(tiny, monkeypatch):
+    args = tiny(env_id="CueRecall-v0")
+    run = ppo_gru.setup(args)
 
     def read_only(*_, **__):
         raise OSError(errno.EROFS, "Read-only file system")
 
-    for name in ("write_bytes", "unlink"):
-        monkeypatch.setattr(script.Path, name, read_only)
-    with pytest.raises(script.RunError, match="Read-only file system"):
-        script.write_file({"weights": {}}, run.folder / "model.pt")
+    for name in ("open", "unlink"):
+        monkeypatch.setattr(Path, name, read_only)
+    with pytest.raises(RunError, match=r"iteration 2: cannot write to .*Read-only file system"):
+        runs.run_to_end(args, run, ppo_gru.train)
 
 
 def test_no_room_for_a_checkpoint(curves):
     """The one before stays whole, and the run goes on from it when there is room again."""
     interval = ["--checkpoint-interval", "10"]
-    folder = ppo_gru.main(ppo_gru.parse_args([*FEW, *interval, "--total-timesteps", "160"]))
+    folder = ppo_gru.main(parse_args(ppo_gru, *FEW, *interval, "--total-timesteps", "160"))
     kept = (folder / "checkpoint-160.pt").read_bytes()
     line = limited(len(kept) // 2, "--resume", str(folder), "--total-timesteps", "480")
     said = (
@@ -444,7 +444,7 @@ def test_no_room_for_a_checkpoint(curves):
     assert (folder / "checkpoint-160.pt").read_bytes() == kept
     time.sleep(1)  # TensorBoard sorts files by the second at which they begin, then by process: of one second, wrongly
     resumed(ppo_gru, folder, "--total-timesteps", "480")
-    assert curves(folder) == curves(ppo_gru.main(ppo_gru.parse_args([*FEW, "--total-timesteps", "480"])))
+    assert curves(folder) == curves(ppo_gru.main(parse_args(ppo_gru, *FEW, "--total-timesteps", "480")))
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
@@ -461,13 +461,13 @@ def test_a_gradient_that_is_no_number(tiny, monkeypatch, script):
     monkeypatch.setattr(script, "ppo_loss", spoilt)
     said = r"iteration 3: the loss or its gradient is not finite; .*; the last checkpoint is \S+checkpoint-128\.pt"
     with pytest.raises(FloatingPointError, match=said):
-        script.run_to_end(args, run)
+        runs.run_to_end(args, run, script.train)
     assert sorted(path.name for path in run.folder.glob("*.pt")) == ["checkpoint-128.pt", "checkpoint-64.pt"]
 
 
-def test_weights_that_are_no_numbers_are_not_written(tiny, tmp_path):
-    run = ppo_gru.setup(tiny(**GRID))
+def test_weights_that_are_no_numbers_are_not_written(tiny, opened, tmp_path):
+    run = opened(ppo_gru, tiny(**GRID))
     next(run.agent.parameters()).data[0] = float("inf")
     with pytest.raises(FloatingPointError, match=r"file\.pt is not written, since weights are not finite; try a lower"):
-        ppo_gru.write_file(ppo_gru.model_of(tiny(**GRID), run), tmp_path / "file.pt")
+        write_file(model_of(tiny(**GRID), run), tmp_path / "file.pt")
     assert not list(tmp_path.glob("file*"))

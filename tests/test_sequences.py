@@ -64,7 +64,7 @@ def test_minibatches_deal_every_step_once(seq_len):
     assert order != [minibatch.first.tolist() for minibatch in minibatches], "the pieces are shuffled again"
 
 
-def test_no_minibatch_is_empty_at_the_limit_of_check_args():
+def test_no_minibatch_is_empty_at_the_limit_of_check_minibatches():
     memory = Memory(Args(hidden_size=4), 4)
     for seed, rate in itertools.product(range(30), (0.0, 0.1, 0.5)):
         torch.manual_seed(seed)
@@ -82,14 +82,13 @@ def test_no_piece_spans_an_episode_s_end():
 
 @pytest.mark.parametrize("seq_len", [0, 8])
 def test_padded_length_is_the_longest_piece(seq_len, monkeypatch):
-    memory = Memory(Args(hidden_size=4, seq_len=seq_len), 4)
-    memory.packed = False  # packed pieces have no padding
+    memory = Memory(Args(hidden_size=4, memory="lstm", seq_len=seq_len), 4)
     seen = []
     recur = memory.recur
     monkeypatch.setattr(memory, "recur", lambda x, hidden: (seen.append(x.shape), recur(x, hidden))[1])
     done = torch.zeros(32, 3, dtype=torch.bool)
     done[[4, 20]] = True
     pieces = memory.cut(done)
-    y = memory.unroll(torch.randn(96, 4), pieces, memory.initial_state(3, 32, torch.device("cpu")))
+    y = memory.unroll(memory.initial_state(3, 32, torch.device("cpu")), torch.randn(96, 4), pieces)
     assert seen == [(len(pieces.length), seq_len or 16, 4)], "the recurrent layers run once, padded no further"
     assert y.shape == (96, 4)

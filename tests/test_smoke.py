@@ -14,12 +14,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from conftest import SCRIPTS, parse_args
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import ppo_gru
 import ppo_trxl
+from ppo_utils import runs
+from ppo_utils.checkpoints import read_model, saved_args
+from ppo_utils.flags import check_args, flag
 
-SCRIPTS = [ppo_gru, ppo_trxl]
 MEMORIES = [
     *({"memory": memory} for memory in ("gru", "lstm", "none")),
     {"script": ppo_trxl},
@@ -28,7 +31,7 @@ MEMORIES = [
 ]
 CURVES = {
     "charts/SPS", "charts/seconds_iteration", "charts/seconds_collect", "charts/seconds_update",
-    "charts/learning_rate", "charts/entropy_coefficient", "charts/padding_fraction",
+    "charts/learning_rate", "charts/entropy_coefficient", "charts/gradient_steps",
     "losses/policy_loss", "losses/value_loss", "losses/entropy", "losses/log_barrier", "losses/loss",
     "losses/approx_kl", "losses/old_approx_kl", "losses/clipfrac", "losses/explained_variance", "losses/grad_norm",
     "losses/ratio_error",
@@ -127,7 +130,7 @@ def test_trains_on_vectors_and_their_frequencies(tiny, scalars, monkeypatch):
     saved = torch.load(path, weights_only=True)
     del saved["args"]["vector_frequencies"]
     torch.save(saved, path)
-    assert ppo_gru.saved_args(ppo_gru.read_model(path)).vector_frequencies == 0
+    assert saved_args(ppo_gru.Args, read_model(path)).vector_frequencies == 0
 
 
 def test_logs_every_number_of_the_final_info(tiny, scalars):
@@ -181,8 +184,8 @@ def test_an_environment_that_fails(tiny):
     assert glob.glob("runs/*/checkpoint-64.pt")
 
 
-def test_lanes_differ_and_neighbouring_seeds_share_none(tiny):
-    first = [ppo_gru.setup(tiny(env_id="MortarMayhem-v0", seed=seed, exp_name=str(seed))) for seed in (1, 2)]
+def test_lanes_differ_and_neighbouring_seeds_share_none(tiny, opened):
+    first = [opened(ppo_gru, tiny(env_id="MortarMayhem-v0", seed=seed, exp_name=str(seed))) for seed in (1, 2)]
     seeds = [set(run.envs.np_random_seed) for run in first]
     assert len(seeds[0]) == len(seeds[1]) == 4
     assert not seeds[0] & seeds[1]
@@ -197,7 +200,7 @@ def test_trains_on_the_levels_asked_for_from_the_first_episode_on(played):
 
 
 def test_runs_that_begin_in_the_same_second_keep_apart(tiny, monkeypatch):
-    monkeypatch.setattr(ppo_gru.time, "time", lambda: 7.0)
+    monkeypatch.setattr(runs.time, "time", lambda: 7.0)
     folders = [ppo_gru.main(tiny(env_id="CueRecall-v0")) for _ in range(3)]
     assert [folder.name.rpartition("__")[2] for folder in folders] == ["7", "7-2", "7-3"]
 
@@ -213,9 +216,10 @@ def test_hyperparameters_are_written_down(tiny):
 def test_tracking(tiny, monkeypatch):
     started = {}
     monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(init=lambda **given: started.update(given)))
-    folder = ppo_gru.main(tiny(env_id="CueRecall-v0", track=True, wandb_entity="us"))
-    assert (started["entity"], started["sync_tensorboard"]) == ("us", True)
-    assert started["name"] == os.path.basename(folder)
+    folder = ppo_gru.main(tiny(env_id="CueRecall-v0", track=True))
+    assert started["sync_tensorboard"]
+    assert started["name"] == started["id"] == os.path.basename(folder)
+    assert started["resume"] == "allow", "a resumed run goes on with the same one"
     assert started["config"]["env_id"] == "CueRecall-v0"
 
 
@@ -271,7 +275,7 @@ def test_target_kl_ends_the_update_at_the_first_minibatch_beyond_it(played, monk
     monkeypatch.setattr(ppo_gru, "ppo_loss", recorded)
     optimizer = torch.optim.SGD(run.agent.parameters(), lr=0.1)
     monkeypatch.setattr(optimizer, "step", lambda step=optimizer.step: (steps.append(1), step()))
-    logs = ppo_gru.update(run.agent, optimizer, run.rollout, 0.0, args)
+    logs = ppo_gru.mean_logs(ppo_gru.update(run.agent, optimizer, run.rollout, 0.0, args), run.rollout)
     if target_kl in (None, 1e9):
         assert len(steps) == len(divergences) == 5 * args.num_minibatches
     else:
@@ -286,35 +290,23 @@ def test_logged_divergences(played):
     rollout = run.rollout
     rollout.log_probs[..., 0] -= 0.2
     pieces = run.agent.memory.cut(rollout.terminated)
-    observations = ppo_gru.UniqueObservations(rollout.obs, run.agent)
-    _, logs = ppo_gru.ppo_loss(run.agent, rollout, observations, pieces, 0.0, args)
+    _, logs = ppo_gru.ppo_loss(run.agent, rollout, pieces, 0.0, args)
     assert logs["old_approx_kl"].item() == pytest.approx(-0.2, abs=1e-5)
     assert logs["approx_kl"].item() == pytest.approx(math.exp(0.2) - 1 - 0.2, abs=1e-5)
     assert logs["clipfrac"].item() == 0.5
     assert logs["ratio_error"].item() == pytest.approx(math.exp(0.2) - 1, abs=1e-5)
 
 
-def test_padding_fraction_is_that_of_the_padded_sequences(tiny, scalars):
-    """Episodes of 6 steps in rollouts of 16: pieces of 6, 6 and 4 steps in each environment."""
-    args = tiny(env_id="Endless-MortarMayhem-v0", env_options='{"max_steps": 6}', total_timesteps=64)
-    assert scalars(ppo_gru.main(args))["charts/padding_fraction"] == [pytest.approx(1 - 16 / 18)]
-
-
-def test_the_transformer_logs_the_window_in_use(tiny, scalars):
-    curves = scalars(ppo_trxl.main(tiny(ppo_trxl, env_id="CueRecall-v0", trxl_memory_length=100)))
-    assert 11 <= max(curves["charts/memory_window"]) <= 13, "the longest episode's, not 100"
-
-
 @pytest.mark.parametrize("memory", [{"script": ppo_trxl, "trxl_gate": "gru"}, {"memory": "lstm"}])
-def test_save_and_load(tiny, memory):
+def test_save_and_load(tiny, opened, memory):
     script = memory.get("script", ppo_gru)
     folder = script.main(tiny(env_id="CueRecall-v0", save_model=True, **memory))
     path = os.path.join(folder, "model.pt")
-    saved = script.read_model(path)
-    args, weights = script.saved_args(saved), saved["weights"]
+    saved = read_model(path)
+    args, weights = saved_args(script.Args, saved), saved["weights"]
     assert args == tiny(env_id="CueRecall-v0", save_model=True, **memory)
     assert all(weight.device.type == "cpu" for weight in weights.values())
-    run = script.setup(tiny(env_id="CueRecall-v0", load_model=path, exp_name="again", seed=9, **memory))
+    run = opened(script, tiny(env_id="CueRecall-v0", load_model=path, exp_name="again", seed=9, **memory))
     for name, weight in run.agent.state_dict().items():
         assert weight.equal(weights[name])
     assert [name for name in os.listdir(folder) if name.startswith("model")] == ["model.pt"]
@@ -331,19 +323,19 @@ def test_capture_video(tiny):
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_presets(script):
     """What a preset holds is a default; what is given wins."""
-    assert script.parse_args([]) == script.Args()
+    assert parse_args(script) == script.Args()
     held = script.PRESETS["laptop"]
-    laptop = script.parse_args(["--preset", "laptop"])
+    laptop = parse_args(script, "--preset", "laptop")
     assert laptop == script.Args(preset="laptop", **held)
-    given = script.parse_args(["--num-steps", "7", "--preset=laptop", "--env-id", "CartPole-v1"])
+    given = parse_args(script, "--num-steps", "7", "--preset=laptop", "--env-id", "CartPole-v1")
     assert (given.num_steps, given.env_id, given.head_size) == (7, "CartPole-v1", held["head_size"])
-    script.check_args(laptop)
+    check_args(laptop)
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_a_preset_is_good_for_environments_without_vectors(scalars, script):
     few = "--num-envs 2 --num-steps 32 --num-minibatches 2 --total-timesteps 64 --no-cuda"
-    args = script.parse_args(["--preset", "laptop", "--env-id", "CartPole-v1", *few.split()])
+    args = parse_args(script, "--preset", "laptop", "--env-id", "CartPole-v1", *few.split())
     assert len(scalars(script.main(args))["losses/loss"]) == 1
 
 
@@ -372,7 +364,7 @@ def test_help(script):
     shown = subprocess.run([sys.executable, script.__file__, "--help"], capture_output=True, text=True, timeout=300)
     assert shown.returncode == 0
     for name in script.Args.__dataclass_fields__:
-        assert f"{script.flag(name)}" in shown.stdout
+        assert flag(name) in shown.stdout
     said = " ".join(shown.stdout.split())
     for bounds in ("INT (1 or more)", "FLOAT (0 to 1)", "INT (0 to 16)", "FLOAT (above 0)"):
         assert bounds in said

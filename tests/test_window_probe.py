@@ -16,9 +16,9 @@ def test_rows_of_the_windows(tiny, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     play, windows = evaluate.play, []
 
-    def spy(checkpoint, seed):
+    def spy(checkpoint, config):
         windows.append(checkpoint.args.trxl_memory_length)
-        return play(checkpoint, seed)
+        return play(checkpoint, config)
 
     monkeypatch.setattr(evaluate, "play", spy)
     window_probe.main(window_probe.Config("model.pt", windows=(3, 7, 100, 200), levels=3, repeats=2))
@@ -30,7 +30,7 @@ def test_rows_of_the_windows(tiny, monkeypatch, capsys):
     assert float(wide[-1]) < 100
     assert wide[1:] == wider[1:], "no episode is longer"
 
-    played = play(evaluate.Checkpoint.read("model.pt", evaluate.Config(levels=3, repeats=2)), 1)
+    played = play(evaluate.Checkpoint.read("model.pt"), evaluate.Config(levels=3, repeats=2))
     assert float(trained[1]) == pytest.approx(played["commands_completed"].mean(), abs=0.005)
     assert float(trained[4]) == np.max(played["length"])
 
@@ -38,7 +38,7 @@ def test_rows_of_the_windows(tiny, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("script", "changes", "told"),
     [
-        (ppo_gru, {}, r"model\.pt was trained by ppo_gru\.py; only transformers"),
+        (ppo_gru, {}, r"model\.pt was trained by ppo_gru\.py; only transformers have a window"),
         (ppo_trxl, {"windows": (4, 0)}, "--windows is 4 0; give windows of 1 step or more"),
         (ppo_trxl, {"windows": ()}, "--windows is empty; give windows of 1 step or more"),
         (ppo_trxl, {"windows": (4,), "max_steps": 2}, "with a window of 4, --max-steps 2 cut episodes short"),

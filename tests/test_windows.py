@@ -2,13 +2,14 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 import torch.nn.functional as F
 
 from enjoy import attention_of, attention_weights
-from ppo_trxl import Args, Attention, Memory, sinusoid, visible
+from ppo_trxl import Args, Attention, Memory, attention_mask, sinusoid
 
 ENCODINGS = ["absolute", "learned", "relative", "none"]
 STEPS, LANES, WIDTH = 24, 3, 8
@@ -17,8 +18,10 @@ STEPS, LANES, WIDTH = 24, 3, 8
 def make_memory(**changes):
     """A small memory in float64 whose parameters are all random: zeros would hide a missing term."""
     small = {"trxl_dim": WIDTH, "trxl_num_heads": 2, "trxl_num_layers": 2, "trxl_memory_length": 5, "num_steps": STEPS}
+    if changes.get("trxl_positional_encoding") == "learned":
+        small["trxl_pe_length"] = 64
     torch.manual_seed(0)
-    memory = Memory(Args(**{**small, "trxl_segment_length": 8, "trxl_pe_length": 64, **changes}), WIDTH).double()
+    memory = Memory(Args(**{**small, "trxl_segment_length": 8, **changes}), WIDTH).double()
     for parameter in memory.parameters():
         torch.nn.init.normal_(parameter, std=0.5)
     return memory
@@ -27,21 +30,32 @@ def make_memory(**changes):
 def fresh(memory, num_envs=LANES, num_steps=STEPS):
     """The memory of fresh episodes in float64."""
     state = memory.initial_state(num_envs, num_steps, torch.device("cpu"))
-    return state._replace(**{name: getattr(state, name).double() for name in ("items", "keys", "values")})
+    return replace(state, **{name: getattr(state, name).double() for name in ("hidden", "keys", "values")})
+
+
+def take_step(memory, state, x):
+    """Take a step, and store what it leaves; return the output."""
+    y, hidden = memory.step(state, x)
+    memory.store(state, hidden)
+    return y
+
+
+def begin_rollout(memory, state):
+    """Begin the next rollout."""
+    memory.begin_rollout(state, memory.carry(state))
 
 
 def make_timeline(memory, seed=1):
-    """Random items, and the steps of episodes that end at random; in environment 0 one also ends before the rollout."""
+    """Random hidden states, and steps of episodes that end at random; in environment 0 one ends before the rollout."""
     generator = torch.Generator().manual_seed(seed)
-    rows = memory.window + STEPS + 1
-    parts = len(memory.blocks) + (memory.query_output is not None)
-    items = torch.randn(rows, LANES, parts, WIDTH, dtype=torch.float64, generator=generator)
+    rows = memory.window + STEPS
+    hidden = torch.randn(rows, LANES, len(memory.blocks) + 1, WIDTH, dtype=torch.float64, generator=generator)
     ends = torch.rand(rows, LANES, generator=generator) < 0.15
     ends[memory.window, 0] = True
     steps = torch.zeros(rows, LANES, dtype=torch.int64)
     for row in range(1, rows):
         steps[row] = (steps[row - 1] + 1).masked_fill(ends[row], 0)
-    return fresh(memory)._replace(now=memory.window + STEPS, items=items, item_steps=steps)
+    return replace(fresh(memory), now=rows, hidden=hidden, stored_step=steps)
 
 
 def naive(memory, x, row, lane, stored, own=None):
@@ -50,28 +64,28 @@ def naive(memory, x, row, lane, stored, own=None):
     own: the blocks' inputs at the segment's earlier steps, which take the place of what is stored; this step's are
     appended.
     """
-    step = int(stored.item_steps[row, lane])
+    step = int(stored.stored_step[row, lane])
     window = min(step, memory.window)
     at = torch.arange(row - window, row)
     told = torch.zeros_like(x)
     if memory.query_position:
         told = told + (memory.table[step] if memory.encoding == "learned" else sinusoid(torch.tensor(step), WIDTH))
     if memory.query_output is not None and step > 0:
-        told = told + memory.query_output.weight @ stored.items[row - 1, lane, -1]
+        told = told + memory.query_output.weight @ stored.hidden[row - 1, lane, -1]
     inputs = []
     for k, block in enumerate(memory.blocks):
         attention = block.attention
         inputs.append(x)
-        items = stored.items[at, lane, k]
+        items = stored.hidden[at, lane, k]
         if own:
             recent = torch.stack([each[k] for each in own])[-window or len(own) :]
             items = torch.cat([items[: window - len(recent)], recent])
-        items = items + memory.position(stored.item_steps[at, lane], x.dtype)
+        items = items + memory.position(stored.stored_step[at, lane], x.dtype)
         normed, query = items, x + (told if k == 0 else 0.0)
         if isinstance(block.norm_query, torch.nn.LayerNorm):  # behind attention and projection instead: figure 2.11a
             normed, query = block.norm_items(items), block.norm_query(query)
-        heads, size = [], WIDTH // attention.heads
-        for h in range(attention.heads):
+        heads, size = [], WIDTH // attention.num_heads
+        for h in range(attention.num_heads):
             of = slice(h * size, (h + 1) * size)
             w_q, w_k, w_v = (layer.weight[of].T for layer in (attention.query, attention.key, attention.value))
             scores = query @ w_q @ (normed @ w_k).T
@@ -120,7 +134,7 @@ def test_unroll_equals_a_window_gathered_for_every_sample(changes):
     wanted = torch.stack(
         [naive(memory, x[i], memory.window + at // LANES, at % LANES, stored) for i, at in enumerate(flat)]
     )
-    found = memory.unroll(x, pieces, stored)
+    found = memory.unroll(stored, x, pieces)
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-10)
     weight = torch.randn_like(wanted)
     inputs = [x, *memory.parameters()]
@@ -143,7 +157,7 @@ def test_the_gradient_through_a_segment_equals_a_loop_s(changes):
         own = []
         for each, at in itertools.islice(steps, length):
             wanted.append(naive(memory, each, memory.window + at // LANES, at % LANES, stored, own))
-    wanted, found = torch.stack(wanted), memory.unroll(x, pieces, stored)
+    wanted, found = torch.stack(wanted), memory.unroll(stored, x, pieces)
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-10)
     weight = torch.randn_like(wanted)
     gradients = [
@@ -158,11 +172,11 @@ def test_how_far_the_gradient_reaches(gate):
     """To the segment's first step, within the window of each block and the episode."""
     memory = make_memory(trxl_memory_gradient=True, trxl_gate=gate, trxl_memory_length=3)
     stored = make_timeline(memory)
-    stored.item_steps[:] = torch.arange(100, 100 + len(stored.item_steps))[:, None]  # an episode that goes on
-    stored.item_steps[memory.window + 12 :, 1] -= 100 + memory.window + 12  # in environment 1 another begins at step 12
+    stored.stored_step[:] = torch.arange(100, 100 + len(stored.stored_step))[:, None]  # an episode that goes on
+    stored.stored_step[memory.window + 12 :, 1] -= 100 + memory.window + 12  # in environment 1, one begins at step 12
     pieces = memory.cut(torch.zeros(STEPS, LANES, dtype=torch.bool))
     x = torch.randn(STEPS * LANES, WIDTH, dtype=torch.float64, requires_grad=True)
-    y = memory.unroll(x, pieces, stored)
+    y = memory.unroll(stored, x, pieces)
     flat = pieces.flat_index()
 
     def reached(t, lane):
@@ -177,7 +191,7 @@ def test_how_far_the_gradient_reaches(gate):
     assert reached(14, 1) == [12, 13, 14], "another episode"
     assert reached(12, 1) == [12]
     plain = make_memory(trxl_gate=gate, trxl_memory_length=3)
-    y = plain.unroll(x, pieces, stored)
+    y = plain.unroll(stored, x, pieces)
     assert reached(15, 0) == [15]
 
 
@@ -185,7 +199,7 @@ def test_how_far_the_gradient_reaches(gate):
 @pytest.mark.parametrize("window", [3, 40])
 def test_playing_equals_unrolling(encoding, window):
     """Three rollouts: an episode of environment 0 spans them all, others end inside them."""
-    memory = make_memory(trxl_positional_encoding=encoding, trxl_memory_length=window, trxl_pe_length=80)
+    memory = make_memory(trxl_positional_encoding=encoding, trxl_memory_length=window)
     state, generator = fresh(memory), torch.Generator().manual_seed(3)
     for _ in range(3):
         x = torch.randn(STEPS, LANES, WIDTH, dtype=torch.float64, generator=generator)
@@ -193,14 +207,13 @@ def test_playing_equals_unrolling(encoding, window):
         done[:, 0] = False
         played = []
         with torch.no_grad():
-            state = memory.begin_rollout(state)
+            begin_rollout(memory, state)
             for t in range(STEPS):
-                y, state = memory.step(x[t], state)
-                state = memory.reset(state, done[t])
-                played.append(y)
+                played.append(take_step(memory, state, x[t]))
+                memory.reset(state, done[t])
         pieces = memory.cut(done)
         index = pieces.flat_index()
-        unrolled = memory.unroll(x.flatten(0, 1)[index], pieces, state)
+        unrolled = memory.unroll(state, x.flatten(0, 1)[index], pieces)
         torch.testing.assert_close(unrolled, torch.stack(played).flatten(0, 1)[index], rtol=0, atol=1e-10)
         with torch.no_grad():
             for parameter in memory.parameters():
@@ -218,7 +231,7 @@ def test_window_edges():
         6: [1, 2, 3, 4, 5],
         99: [1, 2, 3, 4, 5],
     }.items():
-        assert age[visible(age, torch.tensor(step), 5)].tolist() == seen
+        assert age[attention_mask(age, torch.tensor(step), 5)].tolist() == seen
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -227,7 +240,7 @@ def test_attention_weights_are_those_that_were_used(encoding):
     attention = Attention(WIDTH, 2, encoding == "relative").double()
     x, keys, values = (torch.randn(4, length, WIDTH, dtype=torch.float64) for length in (3, 6, 6))
     age = 3 + torch.arange(3)[:, None] - torch.arange(6)
-    seen = visible(age, torch.tensor([0, 1, 2, 3])[:, None, None] + torch.arange(3)[:, None], 4)
+    seen = attention_mask(age, torch.tensor([0, 1, 2, 3])[:, None, None] + torch.arange(3)[:, None], 4)
     weights = attention_weights(attention, x, keys, age, seen)
     assert weights[0, :, 0].eq(0).all(), "the first step of an episode looks at nothing"
     torch.testing.assert_close(weights.sum(-1)[1:], torch.ones(3, 2, 3, dtype=torch.float64))
@@ -264,17 +277,17 @@ def test_attention_of_a_step():
     state = fresh(memory)
     for t in range(9):
         x = torch.randn(LANES, WIDTH, dtype=torch.float64)
-        weights = attention_of(memory, x, state)
+        weights = attention_of(memory, state, x)
         assert weights.shape == (LANES, 2, 2, min(max(t, 1), 5))
         torch.testing.assert_close(weights.sum(-1), torch.full((LANES, 2, 2), float(t > 0), dtype=torch.float64))
         with torch.no_grad():
-            _, state = memory.step(x, state)
+            take_step(memory, state, x)
 
 
 def test_the_drawn_example():
     """What the docstring of Memory.unroll draws."""
     age = torch.arange(4)[:, None] - torch.tensor([-3, -2, -1, 0, 1, 2])
-    seen = visible(age, torch.tensor([5, 6, 0, 1])[:, None], 3).int().tolist()
+    seen = attention_mask(age, torch.tensor([5, 6, 0, 1])[:, None], 3).int().tolist()
     assert seen == [[1, 1, 1, 0, 0, 0], [0, 1, 1, 1, 0, 0], [0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1]]
 
 
@@ -289,16 +302,16 @@ def test_what_is_not_seen_changes_nothing(encoding, fill, flag):
 
     def learn():
         memory.zero_grad()
-        y = memory.unroll(x, pieces, stored)
+        y = memory.unroll(stored, x, pieces)
         y.square().sum().backward()
         return [y.detach(), *(parameter.grad for parameter in memory.parameters())]
 
     clean = learn()
-    stored.items[: memory.window, 0] = fill
+    stored.hidden[: memory.window, 0] = fill
     for lane in range(LANES):
-        ends = (stored.item_steps[1:, lane] == 0).nonzero()[:, 0]
-        stored.items[ends[ends >= memory.window], lane] = fill  # an episode's last item is seen by none
-    assert (stored.items != stored.items.clamp(-1e5, 1e5)).sum() > 50
+        ends = (stored.stored_step[1:, lane] == 0).nonzero()[:, 0]
+        stored.hidden[ends[ends >= memory.window], lane] = fill  # no query attends to an episode's last step
+    assert (stored.hidden != stored.hidden.clamp(-1e5, 1e5)).sum() > 50
     for got, want in zip(learn(), clean, strict=True):
         assert got.equal(want)
 
@@ -308,43 +321,42 @@ def test_a_forgotten_episode_leaves_nothing_in_the_cache():
     state = fresh(memory, 2)
     with torch.no_grad():
         for _ in range(4):
-            _, state = memory.step(torch.full((2, WIDTH), math.nan).double(), state)
-        state = memory.reset(state, torch.tensor([True, True]))
+            take_step(memory, state, torch.full((2, WIDTH), math.nan).double())
+        memory.reset(state, torch.tensor([True, True]))
         for _ in range(7):
-            y, state = memory.step(torch.randn(2, WIDTH).double(), state)
-            assert y.isfinite().all()
+            assert take_step(memory, state, torch.randn(2, WIDTH).double()).isfinite().all()
 
 
-def test_taking_a_step_again_changes_nothing():
+def test_a_step_that_is_not_stored_changes_nothing():
     """As is done to value an observation that is not acted on, the one after the rollout's last step included."""
     memory = make_memory()
     state, again = fresh(memory), fresh(memory)
     with torch.no_grad():
         for _ in range(STEPS):
             x, other = torch.randn(2, LANES, WIDTH).double()
-            memory.step(other, again)
-            (y, state), (y_again, again) = memory.step(x, state), memory.step(x, again)
-            assert y.equal(y_again)
-        memory.step(other, again)
-        for rows in ("items", "item_steps"):
-            assert getattr(state, rows)[:-1].equal(getattr(again, rows)[:-1])
-        state, again = memory.begin_rollout(state), memory.begin_rollout(again)
-        assert memory.step(x, state)[0].equal(memory.step(x, again)[0])
+            memory.step(again, other)
+            assert take_step(memory, state, x).equal(take_step(memory, again, x))
+        memory.step(again, other)
+        for name, part in vars(state).items():
+            assert part == again.now if name == "now" else part.equal(getattr(again, name)), name
+        begin_rollout(memory, state)
+        begin_rollout(memory, again)
+        assert memory.step(state, x)[0].equal(memory.step(again, x)[0])
 
 
-def test_episodes_longer_than_a_learned_encoding():
-    for encoding in ENCODINGS:
-        memory = make_memory(trxl_positional_encoding=encoding, trxl_pe_length=6)
-        state = fresh(memory, 1)
-        state = state._replace(episode_step=state.episode_step + 5)
-        with torch.no_grad():
-            for _ in range(2):  # the sixth step of six, and what follows it, which --bootstrap-truncated values
-                _, state = memory.step(torch.randn(1, WIDTH).double(), state)
-            if encoding == "learned":
-                with pytest.raises(ValueError, match="--trxl-pe-length is 6, but an episode is longer"):
-                    memory.step(torch.randn(1, WIDTH).double(), state)
-            else:
-                memory.step(torch.randn(1, WIDTH).double(), state)
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_episodes_longer_than_a_learned_encoding(encoding):
+    """Steps beyond the table of six have the encoding of step 6, what follows an episode of six steps."""
+    length = {"trxl_pe_length": 6} if encoding == "learned" else {}
+    memory = make_memory(trxl_positional_encoding=encoding, **length)
+    at = memory.position(torch.tensor([4, 5, 6, 7, 5000]), torch.float64)
+    assert at.shape == (5, WIDTH)
+    if encoding == "learned":
+        assert at.equal(memory.table[[4, 5, 6, 6, 6]])
+    state = fresh(memory, 1)
+    with torch.no_grad():
+        for _ in range(9):
+            assert take_step(memory, state, torch.randn(1, WIDTH).double()).isfinite().all()
 
 
 def test_sinusoid():

@@ -175,3 +175,33 @@ def test_reset_needed(env_id):
         env.step(env.action_space.sample())
     env.reset()
     env.step(env.action_space.sample())
+
+
+ALONE = """
+import sys
+
+class OnlyThese:
+    def find_spec(self, name, path=None, target=None):
+        top = name.partition(".")[0]
+        ours = {"memory_gym_envs", "numpy", "gymnasium", "cloudpickle", "farama_notifications", "typing_extensions"}
+        if top not in ours | sys.stdlib_module_names:
+            raise ImportError(f"{top} is not to be imported")
+
+sys.meta_path.insert(0, OnlyThese())
+import gymnasium
+import memory_gym_envs
+for env_id in memory_gym_envs.IDS:
+    envs = gymnasium.make_vec(env_id, num_envs=2)
+    envs.reset(seed=0)
+    envs.step(envs.action_space.sample())
+try:
+    import torch
+except ImportError:
+    print("made without it")
+"""
+
+
+def test_needs_numpy_and_gymnasium_only():
+    folder = Path(memory_gym_envs.__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, cwd=folder)
+    assert (done.stdout, done.stderr, done.returncode) == ("made without it\n", "", 0)

@@ -1,6 +1,5 @@
 """make_envs: every id, of this package and of others, is what a training script takes."""
 
-import subprocess
 import sys
 import traceback
 import zlib
@@ -15,10 +14,19 @@ import pytest
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
 
-import memory_gym_envs
-from memory_gym_envs import IDS, MortarMayhem, final_numbers, final_observations, making, parse_options
-from memory_gym_envs.making import LaneVideo, as_vectors, is_memory_gym, make_envs
-from memory_gym_envs.wrappers import gray
+from memory_gym_envs import IDS, MortarMayhem
+from ppo_utils import video
+from ppo_utils.environments import (
+    final_numbers,
+    final_observations,
+    find_spec,
+    is_memory_gym,
+    make_envs,
+    parse_options,
+)
+from ppo_utils.observations import as_vectors
+from ppo_utils.video import LaneVideo, check_can_film
+from ppo_utils.wrappers import gray
 
 LANES = 3
 GYMNASIUM = {  # the widths of the vectors that they become
@@ -185,7 +193,7 @@ def test_actions_of_another_shape(env_id):
 @pytest.mark.parametrize("env_id", ["Qqqqqqqqqqqq-v0", "Xxxxxxxxxxxx/Qqqqqqqqqqqq-v5"])
 def test_an_id_whose_module_is_not_named(env_id):
     with pytest.raises(gym.error.Error, match="say which module registers it: module:id"):
-        making.find_spec(env_id)
+        find_spec(env_id)
 
 
 @pytest.mark.parametrize("env_id", VECTORS)
@@ -547,7 +555,7 @@ def test_memory_gym_draws_in_both_modes():
 
 def filmed(env_id, num_envs, folder, options=None):
     """Environments whose first episodes have begun and are being recorded."""
-    making.check_can_film(env_id)
+    check_can_film(env_id)
     envs = make_envs(env_id, num_envs, render_mode="debug_rgb_array")
     envs.reset(seed=0, options=options)
     return LaneVideo(envs, str(folder))
@@ -573,7 +581,7 @@ def test_videos_are_of_whole_episodes_of_lane_0(tmp_path, recwarn, capfd, monkey
 
 
 def test_an_endless_episode_has_a_video_too(tmp_path, monkeypatch):
-    monkeypatch.setattr(making, "MAX_VIDEO_FRAMES", 10)
+    monkeypatch.setattr(video, "MAX_VIDEO_FRAMES", 10)
     for steps, expected in ((5, 6), (25, 10)):
         envs = filmed("Endless-MortarMayhem-v0", 2, tmp_path / str(steps), {"explosion_delay": [1000]})
         list(roll(envs, steps))
@@ -782,10 +790,10 @@ def test_other_autoreset_is_refused():
 
 def test_videos_need_the_extra_and_pictures(monkeypatch):
     with pytest.raises(ValueError, match=r"--capture-video needs .* draws pictures .*CueRecall-v0 draws none"):
-        making.check_can_film("CueRecall-v0")
+        check_can_film("CueRecall-v0")
     monkeypatch.setitem(sys.modules, "moviepy", None)
     with pytest.raises(ImportError, match=r'--capture-video needs moviepy: pip install -e "\.\[play\]"'):
-        making.check_can_film("MysteryPath-v0")
+        check_can_film("MysteryPath-v0")
 
 
 def test_vectors_that_are_not_there_are_told(capfd):
@@ -793,32 +801,3 @@ def test_vectors_that_are_not_there_are_told(capfd):
     assert capfd.readouterr().err == "", "it shows vectors anyway"
     make_envs(needs("ale_py:ALE/Pong-v5"), 1, obs_type="vector").close()
     assert "ale_py:ALE/Pong-v5 has no vectors to show instead of its observation\n" in capfd.readouterr().err
-
-
-ALONE = """
-import sys
-
-class OnlyThese:
-    def find_spec(self, name, path=None, target=None):
-        top = name.partition(".")[0]
-        ours = {"memory_gym_envs", "numpy", "gymnasium", "cloudpickle", "farama_notifications", "typing_extensions"}
-        if top not in ours | sys.stdlib_module_names:
-            raise ImportError(f"{top} is not to be imported")
-
-sys.meta_path.insert(0, OnlyThese())
-import memory_gym_envs
-for env_id in (*memory_gym_envs.IDS, "CartPole-v1"):
-    envs = memory_gym_envs.make_envs(env_id, 2, seed=0, step_encoding=True, observe_last_action=True)
-    envs.reset()
-    envs.step(envs.action_space.sample())
-try:
-    import torch
-except ImportError:
-    print("made without it")
-"""
-
-
-def test_needs_numpy_and_gymnasium_only():
-    folder = Path(memory_gym_envs.__file__).parents[1]
-    done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, cwd=folder)
-    assert (done.stdout, done.stderr, done.returncode) == ("made without it\n", "", 0)

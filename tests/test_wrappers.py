@@ -12,7 +12,7 @@ from gymnasium.wrappers import FrameStackObservation, TransformObservation
 from players import choices
 
 from memory_gym_envs.searing_spotlights import BEND, START, TOWARD
-from memory_gym_envs.wrappers import GrayscaleStack, SpotlightPerturbation, StepEncoding, VectorStack, gray
+from ppo_utils.wrappers import GrayscaleStack, SpotlightPerturbation, StepEncoding, VectorStack, gray
 
 LANES = 3
 SHORT = "Endless-MysteryPath-v0", "MortarMayhemB-Grid-v0"  # whose random episodes are; a picture and a Dict

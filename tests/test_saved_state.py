@@ -13,9 +13,9 @@ from helpers import EACH, EACH_OBS, HASTY, check_same
 from players import FAMILY, stumbling
 from test_lanes import CHANGED, OPTIONS
 
-from memory_gym_envs import load_state, make_envs, save_state
-from memory_gym_envs.making import LaneVideo
 from memory_gym_envs.saving import BIT_GENERATORS, plain, restored
+from ppo_utils.environments import load_state, make_envs, save_state
+from ppo_utils.video import LaneVideo
 
 LANES = 3
 WRAPPERS = {

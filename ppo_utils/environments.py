@@ -1,9 +1,10 @@
-"""Making any Gymnasium id ready to train on, for scripts that do not ask what the environment is.
+"""Environments ready to train on: any Gymnasium id, whatever it observes and however it resets.
 
-`make_envs` is a table of contents of vector wrappers; `save_state` and `load_state` copy the state of all of them.
-What a training script counts and logs is read from infos:
-`final_numbers` and `final_observations` take from them what belongs to the episodes that just ended.
-Shape letters: N lanes, A action branches, H, W and C of a picture, V of a vector.
+`make_envs` is a table of contents of vector wrappers, `envs_for` calls it with a script's arguments; `save_state` and
+`load_state` copy the state of all of them. What a training counts and logs is read from infos: `ground_truth_of`,
+`final_numbers` and `final_observations` take it from them.
+A lane is one of the N environments that step together.
+Shape letters: N lanes, A action branches, G entries of the ground truth.
 """
 
 import contextlib
@@ -12,34 +13,43 @@ import importlib
 import json
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
-from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
-from gymnasium.wrappers.vector import RecordEpisodeStatistics, RecordVideo, TransformAction
+from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformAction
+from torch import Tensor
 
-from memory_gym_envs.base import MemoryGymVectorEnv, checked_integer
+import memory_gym_envs  # noqa: F401 (registers its ids)
+from memory_gym_envs.base import checked_integer
 from memory_gym_envs.options import brief
 from memory_gym_envs.saving import Saved
-from memory_gym_envs.wrappers import (
+from ppo_utils.observations import ObservationParts
+from ppo_utils.wrappers import (
     GrayscaleStack,
     LastAction,
     SpotlightPerturbation,
     StepEncoding,
     VectorStack,
     branch_sizes,
-    named,
-    one_hot,
 )
 
-SMALLEST_PICTURE = 36  # pixels along a side; what is smaller becomes a vector
-MAX_VIDEO_FRAMES = 1000
+
+def envs_for(args: Any, num_envs: int, **kwargs: Any) -> VectorEnv:
+    """Make the environments that a script's arguments describe; kwargs and errors are those of `make_envs`."""
+    names = ("num_levels", "start_level", "obs_type")
+    names += ("frame_stack", "step_encoding", "observe_last_action", "spotlight_perturbation")
+    kwargs |= {name: getattr(args, name) for name in names}
+    return make_envs(args.env_id, num_envs, options=parse_options(args.env_id, args.env_options), **kwargs)
+
+
+def as_tensors(obs: dict[str, np.ndarray], device: torch.device) -> dict[str, Tensor]:
+    """Move observations to a device."""
+    return {name: torch.from_numpy(part).to(device) for name, part in obs.items()}
 
 
 def make_envs(
@@ -361,130 +371,20 @@ def branch_actions(envs: VectorEnv) -> VectorEnv:
     return TransformAction(envs, to_env, single_action_space=gym.spaces.MultiDiscrete(sizes))
 
 
-# ---- observations ----
+# ---- what infos say ----
 
 
-class ObservationParts(VectorWrapper):
-    """Every observation as a dict of named parts, in `final_obs` too: each a picture or a vector.
+def ground_truth_of(infos: dict[str, Any], args: Any) -> np.ndarray | None:
+    """Return the ground truth (N, G) that --ground-truth-coef estimates, None where it is 0.
 
-    The parts of a Dict keep their names and their order; any other observation is one part named "observation".
-    Pictures are Box (H, W, C) with sides of at least 36, uint8, or float32 from 0 to 1; two-dimensional ones get a
-    channel, and channels that come first go last. All else becomes a vector (V,) float32, as Gymnasium's `flatten`
-    makes it: Box of any shape, Discrete and MultiDiscrete (one-hot), MultiBinary, and Tuple and Dict of these.
-    Text is left out, and a line on stderr says so.
-
-    Raises ValueError for other spaces, for pictures of other numbers, and if nothing is left to observe.
+    Raises ValueError if the environment reports none.
     """
-
-    def __init__(self, env: VectorEnv):
-        super().__init__(env)
-        given = named(env.single_observation_space)
-        texts = [name for name, space in given.items() if is_text(space)]
-        if texts:
-            print(f"{env.spec.id}: the text {', '.join(texts)} is left out of the observation", file=sys.stderr)
-        self._convert = {name: converter(name, space) for name, space in given.items() if name not in texts}
-        if not self._convert:
-            raise ValueError(
-                f"the observation space {brief(env.single_observation_space)} is not supported; it is all text"
-            )
-        parts = {name: converted_space(given[name], convert) for name, convert in self._convert.items()}
-        self.single_observation_space = gym.spaces.Dict(parts, sort_keys=False)
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """The environment's reset, its observations in parts."""
-        observations, infos = self.env.reset(seed=seed, options=options)
-        return self.parts(observations), infos
-
-    def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], Any, Any, Any, dict[str, Any]]:
-        """One step of every lane, its observations in parts, those in `final_obs` too."""
-        observations, rewards, terminated, truncated, infos = self.env.step(actions)
-        if "final_obs" in infos:
-            space, final = self.env.single_observation_space, infos["final_obs"]
-            (ended,) = infos["_final_obs"].nonzero()
-            last = self.parts(concatenate(space, final[ended], create_empty_array(space, len(ended))))
-            for row, lane in enumerate(ended.tolist()):
-                final[lane] = {name: part[row] for name, part in last.items()}
-        return self.parts(observations), rewards, terminated, truncated, infos
-
-    def parts(self, observations: Any) -> dict[str, np.ndarray]:
-        """The parts of observations, each (N, ...); no copies of what is right already."""
-        given = named(observations)
-        return {name: convert(given[name]) for name, convert in self._convert.items()}
-
-
-def converter(name: str, space: gym.Space) -> Callable[[Any], np.ndarray]:
-    """What makes pictures or vectors of a batch of this part of the observations; ValueError if nothing can."""
-    if isinstance(space, gym.spaces.Box):
-        layout = picture_layout(space.shape)
-        if layout is not None and (space.dtype == np.uint8 or (space.low.min() >= 0 and space.high.max() <= 1)):
-            return partial(as_pictures, layout)
-        supported = layout in (None, "HW")  # a matrix of other numbers is no picture
-    else:
-        supported = is_flattenable(space)
-    if supported:
-        return partial(as_vectors, space)
-    raise ValueError(
-        f"the observation space {name}: {brief(space)} is not supported; use pictures (height, width, "
-        "channels) of bytes or of numbers from 0 to 1, Box, Discrete, MultiDiscrete, MultiBinary, Tuple or Dict"
-    )
-
-
-def converted_space(space: gym.Space, convert: Callable[[Any], np.ndarray]) -> gym.spaces.Box:
-    """The space of what `converter` makes of one observation from this space."""
-    with np.errstate(over="ignore"):  # bounds beyond float32 become infinite
-        if convert.func is as_vectors:
-            flat = gym.spaces.flatten_space(space)
-            return gym.spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32))
-        low, high = (convert(bound[None])[0] for bound in (space.low, space.high))
-        return gym.spaces.Box(low, high, dtype=low.dtype)
-
-
-def picture_layout(shape: tuple[int, ...]) -> str | None:
-    """Which axes of a Box are a picture's: height, width and channels; None if it is too small to be one."""
-    large = tuple(side >= SMALLEST_PICTURE for side in shape)
-    layouts = {(True, True): "HW", (True, True, False): "HWC", (True, True, True): "HWC", (False, True, True): "CHW"}
-    return layouts.get(large)
-
-
-def as_pictures(layout: str, values: np.ndarray) -> np.ndarray:
-    """A batch of pictures in this layout as (N, H, W, C), bytes or float32."""
-    if layout == "HW":
-        values = values[..., None]
-    elif layout == "CHW":
-        values = np.moveaxis(values, 1, -1)
-    return np.ascontiguousarray(values, np.uint8 if values.dtype == np.uint8 else np.float32)
-
-
-def as_vectors(space: gym.Space, values: Any) -> np.ndarray:
-    """What Gymnasium's `flatten` makes of each of a batch of observations, (N, V) float32, all lanes at once."""
-    if isinstance(space, gym.spaces.Dict):
-        return np.concatenate([as_vectors(part, values[name]) for name, part in space.spaces.items()], axis=1)
-    if isinstance(space, gym.spaces.Tuple):
-        return np.concatenate([as_vectors(*each) for each in zip(space.spaces, values, strict=True)], axis=1)
-    rows = np.reshape(values, (len(values), -1))
-    if isinstance(space, gym.spaces.Discrete):
-        return one_hot(rows - space.start, np.array([space.n]))
-    if isinstance(space, gym.spaces.MultiDiscrete):
-        return one_hot(rows - space.start.ravel(), space.nvec.ravel())
-    return np.ascontiguousarray(rows, np.float32)
-
-
-def is_flattenable(space: gym.Space) -> bool:
-    """Whether `as_vectors` knows the space, and what is in it."""
-    if isinstance(space, (gym.spaces.Dict, gym.spaces.Tuple)):
-        inside = list(named(space).values()) if isinstance(space, gym.spaces.Dict) else space.spaces
-        return bool(inside) and all(map(is_flattenable, inside))
-    known = gym.spaces.Box, gym.spaces.Discrete, gym.spaces.MultiDiscrete, gym.spaces.MultiBinary
-    return isinstance(space, known)
-
-
-def is_text(space: gym.Space) -> bool:
-    """Whether the space is of strings: Gymnasium's Text, or one of a package's own such as MiniGrid's missions."""
-    return space.dtype is not None and space.dtype.kind == "U"
-
-
-# ---- what infos say of ended episodes ----
+    if not args.ground_truth_coef:
+        return None
+    truth = np.asarray(infos.get("ground_truth"))
+    if truth.ndim != 2 or truth.dtype.kind not in "biuf":
+        raise ValueError("--ground-truth-coef needs an environment that has ground_truth, an array, in its info; use 0")
+    return truth
 
 
 def final_numbers(infos: dict[str, Any], lanes: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
@@ -532,64 +432,3 @@ class EpisodeStatistics(Saved, RecordEpisodeStatistics):
             getattr(self, name).clear()
             getattr(self, name).extend(state[name])
         self.episode_start_times = np.full(self.num_envs, time.perf_counter())
-
-
-# ---- videos ----
-
-
-class LaneVideo(Saved, RecordVideo):
-    """Videos of lane 0: of the episodes that Gymnasium's capped cubic schedule picks (0, 1, 8, 27, ...).
-
-    env: has been reset; its present episode is number 0. folder: is made if it is not there.
-    A video shows every observation that was acted on, up to the first 1,000. What is being recorded is written by
-    close(). Its state is the number of the episode alone.
-    """
-
-    kept = ("episode_id", "step_id")
-
-    def __init__(self, env: VectorEnv, folder: str):
-        with warnings.catch_warnings():
-            # That the observation after an episode's last action is missing, and that the folder is there already.
-            warnings.simplefilter("ignore")
-            super().__init__(env, folder, record_first_only=True)
-        self.episode_id = 0
-        self.start_recording(f"{self.name_prefix}-episode-0")
-        self._capture_frame()
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Takes over the number of the episode, of which the beginning is missing: it has no video."""
-        super().set_state(state)
-        self.recording, self.recorded_frames = False, []
-
-    def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], Any, Any, Any, dict[str, Any]]:
-        """One step of every lane; a video that is long enough ends here."""
-        result = super().step(actions)
-        if self.recording and len(self.recorded_frames) >= MAX_VIDEO_FRAMES:
-            self.stop_recording()
-        return result
-
-    def _capture_frame(self) -> None:
-        """Keep lane 0's picture; Gymnasium's own method has all lanes draw theirs, 32 times the work."""
-        envs = self.unwrapped
-        if isinstance(envs, MemoryGymVectorEnv):
-            (picture,) = envs.render(np.zeros(1, np.intp))
-        else:
-            picture = envs.envs[0].render() if isinstance(envs, SyncVectorEnv) else envs.render()[0]
-        self.recorded_frames.append(picture)
-
-
-def check_can_film(env_id: str) -> None:
-    """Raise ImportError without the extra `play`, ValueError if the environment says that it draws no pictures."""
-    try:
-        importlib.import_module("moviepy")
-    except ImportError:
-        raise ImportError('--capture-video needs moviepy: pip install -e ".[play]"') from None
-    check_draws("--capture-video", env_id)
-
-
-def check_draws(what: str, env_id: str) -> None:
-    """Raise ValueError, which begins with what needs them, if the environment says that it draws no pictures."""
-    spec = find_spec(env_id)
-    metadata = getattr(creator(spec.entry_point or spec.vector_entry_point), "metadata", None)
-    if metadata is not None and "rgb_array" not in metadata.get("render_modes", ()):
-        raise ValueError(f"{what} needs an environment that draws pictures (rgb_array); {spec.id} draws none")

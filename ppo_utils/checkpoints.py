@@ -1,0 +1,269 @@
+"""Models and checkpoints: what a file holds, how it is written and read, and how a run goes on from it.
+
+A model has a script's name, its arguments, the weights and the step; a checkpoint also has all that the run goes on
+with, in tensors and plain values, which torch.load(weights_only=True) takes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import os
+import random
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ppo_utils.environments import ground_truth_of, load_state, save_state
+from ppo_utils.flags import as_flags, flag
+from ppo_utils.processes import all_gather, rank_and_size
+
+if TYPE_CHECKING:
+    from ppo_utils.runs import Run
+
+T = TypeVar("T")  # a script's Args
+CHECKPOINTS_KEPT = 2
+
+
+# ---- writing ----
+def model_of(args: Any, run: Run) -> dict[str, Any]:
+    """Return what a model's file holds, which is a part of what a checkpoint holds."""
+    saved = {"script": run.script, "args": asdict(replace(args, resume=None)), "step": run.step}
+    return saved | {"weights": run.agent.state_dict()}
+
+
+def save_checkpoint(args: Any, run: Run) -> None:
+    """Write all that a run goes on with, and keep the checkpoint before it. Raises what `write_file` raises."""
+    processes = all_gather(state_of_process(run))
+    if run.writer is None:
+        return
+    run.writer.flush()  # a checkpoint means that the curves are there too
+    saved = {"seconds": run.seconds, "returns": list(run.returns), "lengths": list(run.lengths)}
+    saved["optimizer"] = run.optimizer.state_dict()
+    saved["processes"] = map_nested(processes, np.ndarray, torch.from_numpy)  # weights_only loads no arrays
+    write_file(model_of(args, run) | saved, run.folder / f"checkpoint-{run.step}.pt")
+    for path in checkpoints_in(run.folder)[:-CHECKPOINTS_KEPT]:
+        path.unlink()
+
+
+def state_of_process(run: Run) -> dict[str, Any]:
+    """Return what each process goes on with: environments, memory and generators, in arrays, tensors and numbers."""
+    rollout = run.rollout
+    return {
+        "environments": save_state(run.envs),
+        "next_obs": rollout.next_obs,
+        "next_ground_truth": rollout.next_ground_truth,
+        "memory": run.agent.memory.carry(rollout.memory),
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state(rollout.values.device) if rollout.values.is_cuda else None,
+        "numpy": np.random.get_state(),  # noqa: NPY002 (it and Python's: environments of other packages may use them)
+        "python": random.getstate(),
+    }
+
+
+def write_file(saved: dict[str, Any], path: Path) -> None:
+    """Write a model or a checkpoint, in the first process, atomically: the file is whole, or it is not there.
+
+    Raises FloatingPointError, and writes nothing, if a weight is not finite; OSError if it cannot be written.
+    """
+    if rank_and_size()[0] > 0:
+        return
+    if not all(weight.isfinite().all() for weight in saved["weights"].values()):
+        raise FloatingPointError(f"{path} is not written, since weights are not finite; try a lower --init-lr")
+    part, content = Path(f"{path}.part"), io.BytesIO()
+    torch.save(saved, content)
+    try:
+        with part.open("wb") as file:
+            file.write(content.getbuffer())
+            file.flush()
+            os.fsync(file.fileno())  # on the disk before it has its name
+        os.replace(part, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
+    finally:
+        with contextlib.suppress(OSError):  # the error of writing is being raised already
+            part.unlink(missing_ok=True)
+
+
+def map_nested(value: Any, kind: type, function: Callable) -> Any:
+    """Apply a function to all values of a kind in nested dicts, lists and tuples."""
+    if isinstance(value, dict):
+        return {name: map_nested(each, kind, function) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(map_nested(each, kind, function) for each in value)
+    return function(value) if isinstance(value, kind) else value
+
+
+# ---- reading ----
+def checkpoints_in(folder: str | Path) -> list[Path]:
+    """Return the checkpoints of a run, the latest last."""
+    found = {int(path.stem[11:]): path for path in Path(folder).glob("checkpoint-*.pt") if path.stem[11:].isdecimal()}
+    return [found[step] for step in sorted(found)]
+
+
+def read_checkpoint(folder: str | Path) -> dict[str, Any]:
+    """Read a run's last checkpoint, which has all that `read_model` returns and more.
+
+    Raises ValueError if it is not whole, OSError if there is none.
+    """
+    if not (found := checkpoints_in(folder)):
+        raise OSError(f"--resume {folder}: there is no checkpoint-STEP.pt in this folder")
+    try:
+        return read_model(found[-1])
+    except ValueError as error:
+        before = f"go on from {found[-2]}" if len(found) > 1 else "begin again"
+        raise ValueError(f"{error}; remove it to {before}") from None
+
+
+def read_model(path: str | Path) -> dict[str, Any]:
+    """Read a model or a checkpoint to the CPU: a dict with script, args, weights, and all else that the file holds.
+
+    Raises ValueError if it is not such a file, OSError if it cannot be read.
+    """
+    if not os.path.isfile(path):
+        raise OSError(f"there is no file {path}; --save-model writes model.pt to the run folder")
+    content = io.BytesIO(Path(path).read_bytes())
+    try:
+        saved = torch.load(content, map_location="cpu", weights_only=True)
+        return {**saved, "script": saved["script"], "args": dict(saved["args"]), "weights": dict(saved["weights"])}
+    except Exception:  # torch.load raises many kinds of errors for a wrong file, and none tells more
+        raise ValueError(f"{path} is cut short, or neither a model nor a checkpoint") from None
+
+
+def saved_args(kind: type[T], saved: dict[str, Any]) -> T:
+    """Return the arguments, of a script's Args, in what `read_model` read; a flag that is newer has its default."""
+    known = {each.name for each in fields(kind)}
+    return kind(**{name: value for name, value in saved["args"].items() if name in known})
+
+
+def import_script(saved: dict[str, Any], path: str | Path) -> ModuleType:
+    """Import the script that wrote a file, which lies beside the program that runs or in the current folder.
+
+    Raises ValueError if it is not there, or not named ppo_NAME.
+    """
+    name = str(saved["script"])
+    if "" not in sys.path:
+        sys.path.append("")  # the current folder, after all others
+    try:
+        if not re.fullmatch(r"ppo_\w+", name):
+            raise ModuleNotFoundError(name=name)
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise
+        raise ValueError(f"{path} was trained by {name}.py, which is not here; run this beside that script") from None
+
+
+def make_agent(kind: type[nn.Module], envs: gym.vector.VectorEnv, infos: dict, args: Any) -> nn.Module:
+    """Make an agent, of a script's Agent, for environments; infos are those of a reset.
+
+    Raises ValueError for spaces that do not suit, or if there is no ground truth to estimate.
+    """
+    truth = ground_truth_of(infos, args)
+    size = 0 if truth is None else truth.shape[1]
+    return kind(envs.single_observation_space, envs.single_action_space.nvec.tolist(), args, size)
+
+
+def load_weights(agent: nn.Module, saved: dict[str, Any], path: str | Path) -> None:
+    """Give the agent the weights in what `read_model` read; auxiliary heads may be added to it or left out.
+
+    Raises ValueError if they are another network's, or not finite.
+    """
+    try:
+        missing, unexpected = agent.load_state_dict(saved["weights"], strict=False)
+        if not all(name.startswith(("decoder.", "estimator.")) for name in (*missing, *unexpected)):
+            raise RuntimeError
+    except (RuntimeError, TypeError):
+        raise ValueError(f"{path} holds the weights of another network") from None
+    if not all(weight.isfinite().all() for weight in saved["weights"].values()):
+        raise ValueError(f"{path} holds weights that are not finite: the training diverged")
+
+
+# ---- going on ----
+def check_resumed(args: Any, saved: dict[str, Any], script: str) -> None:
+    """Raise ValueError if the arguments are not those of the run that --resume goes on with."""
+    if saved["script"] != script:
+        raise ValueError(f"--resume {args.resume}: this run is {saved['script']}.py's, not {script}.py's")
+    if "processes" not in saved:
+        raise ValueError(f"--resume {args.resume}: its last checkpoint holds weights alone; --load-model takes these")
+    theirs = saved_args(type(args), saved)
+    for name in (each.name for each in fields(args) if each.name not in ("resume", "total_timesteps")):
+        if getattr(args, name) != getattr(theirs, name):
+            raise ValueError(
+                f"{flag(name)} is {getattr(args, name)}, but the run in {args.resume} has {getattr(theirs, name)}; "
+                "leave the flag out, or begin another run"
+            )
+    if args.total_timesteps < theirs.total_timesteps:
+        raise ValueError(
+            f"--total-timesteps is {args.total_timesteps}, but the run in {args.resume} has {theirs.total_timesteps}; "
+            "it may be extended only"
+        )
+    before, processes = len(saved["processes"]), rank_and_size()[1]
+    if before != processes:
+        raise ValueError(f"--resume {args.resume}: this run has {before} processes, not {processes}; start as many")
+
+
+def load_model(args: Any, agent: nn.Module, script: str) -> None:
+    """Give the agent the weights of --load-model.
+
+    Raises ValueError if another script, or one with other flags of the network, trained them; OSError without a file.
+    """
+    path = args.load_model
+    saved = read_model(path)
+    if saved["script"] != script:
+        raise ValueError(f"{path} was trained by {saved['script']}.py, not by {script}.py")
+    theirs = saved_args(type(args), saved)
+    observed = ("env_id", "obs_type", "frame_stack", "step_encoding", "observe_last_action", "vector_frequencies")
+    flags = (*observed, "embedding", "head_size", *agent.memory.flags)
+    try:
+        load_weights(agent, saved, path)
+    except ValueError as error:
+        if "another network" not in str(error):
+            raise
+        trained_with = as_flags({name: getattr(theirs, name) for name in flags})
+        raise ValueError(f"{error}, trained with {trained_with}") from None
+
+
+def load_checkpoint(run: Run, saved: dict[str, Any]) -> None:
+    """Set a run that was just made to what `save_checkpoint` wrote: it goes on as if it had never stopped.
+
+    Environments of other packages begin new episodes, with a line that says so. Raises ValueError if weights, optimizer
+    or environments do not fit.
+    """
+    load_weights(run.agent, saved, run.folder)
+    run.optimizer.load_state_dict(saved["optimizer"])
+    for weight, moments in run.optimizer.state.items():
+        if moments["exp_avg"].shape != weight.shape:  # torch tells the weights apart by their order alone
+            raise ValueError(
+                f"{run.folder}: its checkpoint is of a version with the weights in another order, and training cannot "
+                "go on from it; --load-model takes its weights"
+            )
+    run.step, run.seconds = saved["step"], saved["seconds"]
+    run.returns.extend(saved["returns"])
+    run.lengths.extend(saved["lengths"])
+    rank, rollout = rank_and_size()[0], run.rollout
+    state = saved["processes"][rank]
+    random.setstate(state["python"])
+    torch.set_rng_state(state["torch"])
+    if state["cuda"] is not None and rollout.values.is_cuda:
+        torch.cuda.set_rng_state(state["cuda"], rollout.values.device)
+    names = ("environments", "next_obs", "next_ground_truth", "numpy")
+    arrays = map_nested({name: state[name] for name in names}, Tensor, Tensor.numpy)
+    np.random.set_state(arrays["numpy"])  # noqa: NPY002
+    if arrays["environments"] is None:
+        if rank == 0:
+            print(f"{run.envs.spec.id} has no state to save: every environment begins a new episode", file=sys.stderr)
+        return
+    load_state(run.envs, arrays["environments"])
+    rollout.next_obs, rollout.next_ground_truth = arrays["next_obs"], arrays["next_ground_truth"]
+    run.agent.memory.begin_rollout(rollout.memory, state["memory"])

@@ -1,0 +1,86 @@
+"""Flags of the scripts: their types with bounds, their spelling, and the checks that need no environment."""
+
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+
+import tyro
+
+from ppo_utils.processes import rank_and_size
+
+
+class Bounds(NamedTuple):
+    """The numbers that a flag takes: low to high, both included unless `above`, which leaves out low."""
+
+    low: float
+    high: float = float("inf")
+    above: bool = False
+
+    def __str__(self) -> str:
+        if self.high == float("inf"):
+            return f"above {self.low}" if self.above else f"{self.low} or more"
+        return f"{self.low} to {self.high}"
+
+    def include(self, number: float) -> bool:
+        """Return whether a number is within the bounds; NaN never is."""
+        return self.low < number <= self.high if self.above else self.low <= number <= self.high
+
+
+def bounded(kind: type, *bounds: Any) -> Any:
+    """Return the type of a flag with these `Bounds`: --help shows them, and `check_args` enforces them."""
+    return Annotated[kind, Bounds(*bounds), tyro.conf.arg(metavar=f"{kind.__name__.upper()} ({Bounds(*bounds)})")]
+
+
+PositiveInt = bounded(int, 1)
+NonNegativeInt = bounded(int, 0)
+PositiveFloat = bounded(float, 0, float("inf"), True)
+NonNegativeFloat = bounded(float, 0)
+UnitInterval = bounded(float, 0, 1)
+
+
+def flag(name: str) -> str:
+    """Return the command line's spelling of a field of Args."""
+    return "--" + name.replace("_", "-")
+
+
+def as_flags(values: dict[str, Any]) -> str:
+    """Return values of fields of Args as a command line."""
+    return " ".join(
+        flag(name if value else f"no_{name}") if isinstance(value, bool) else f"{flag(name)} {value}"
+        for name, value in values.items()
+    )
+
+
+def check_args(args: Any) -> None:
+    """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work."""
+    for name, kind in get_type_hints(type(args), include_extras=True).items():
+        value, parts = getattr(args, name), (kind, *get_args(kind))  # float | None has its bounds in a part
+        for bounds in (each for part in parts for each in getattr(part, "__metadata__", ())):
+            if isinstance(bounds, Bounds) and value is not None and not bounds.include(value):
+                raise ValueError(f"{flag(name)} is {value}; it must be {bounds}")
+        if get_origin(kind) is Literal and value not in get_args(kind):  # in Python; tyro checks the command line
+            raise ValueError(f"{flag(name)} is {value!r}; it must be one of {', '.join(get_args(kind))}")
+        if isinstance(value, int) and value >= 2**63:  # torch and NumPy take no more
+            raise ValueError(f"{flag(name)} is {value}; it must be below 2 ** 63")
+    if not args.exp_name or set(args.exp_name) & set("/\\"):
+        raise ValueError(f"--exp-name is {args.exp_name!r}; it must be a name without slashes")
+    for name in ("reconstruction", "ground_truth"):
+        if getattr(args, f"{name}_detach") and not getattr(args, f"{name}_coef"):
+            raise ValueError(f"{flag(f'{name}_detach')} needs {flag(f'{name}_coef')} above 0")
+    batch_size = args.num_envs * args.num_steps
+    if args.total_timesteps < batch_size:
+        raise ValueError(
+            f"--total-timesteps is {args.total_timesteps}, less than one iteration of {batch_size} steps "
+            f"(--num-envs {args.num_envs} x --num-steps {args.num_steps})"
+        )
+    if args.num_envs % rank_and_size()[1]:
+        raise ValueError(f"--num-envs is {args.num_envs}; it must be a multiple of the {rank_and_size()[1]} processes")
+
+
+def check_minibatches(args: Any, longest_piece: int) -> None:
+    """Raise ValueError if a minibatch could be empty; longest_piece: steps that a piece of a rollout may have."""
+    steps = args.num_envs * args.num_steps // rank_and_size()[1]
+    if args.num_minibatches * longest_piece > steps:
+        raise ValueError(
+            f"--num-minibatches is {args.num_minibatches}, but an iteration may have only {steps // longest_piece} "
+            f"sequences (up to {longest_piece} of {steps} steps each); use at most that many, or more environments "
+            "(--num-envs)"
+        )
