@@ -42,7 +42,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.util.tensor_util import make_ndarray
 from tqdm import tqdm
 
-from ppo_utils.checkpoints import import_script, load_weights, make_agent, read_model, saved_args
+from ppo_utils.checkpoints import RENAMED, import_script, load_weights, make_agent, read_model, saved_args
 from ppo_utils.environments import envs_for
 from ppo_utils.evaluation import evaluate, evaluation_levels
 from ppo_utils.flags import flag
@@ -365,6 +365,7 @@ def with_defaults(given: dict[str, str]) -> dict[str, str]:
         defaults = asdict(import_script({"script": name}, name).Args())
     except ValueError:  # the script is not here
         defaults = given
+    given = {RENAMED.get(key, key): value for key, value in given.items()}
     return {"script": name} | {key: given.get(key, str(value)) for key, value in defaults.items()}
 
 

@@ -43,15 +43,7 @@ from torch.nn.utils.rnn import pad_sequence
 from ppo_utils.checkpoints import make_agent
 from ppo_utils.environments import as_tensors, final_numbers, final_observations, ground_truth_of
 from ppo_utils.fast import encode, first_occurrences, in_chunks, packed_gru
-from ppo_utils.flags import (
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    UnitInterval,
-    bounded,
-    check_minibatches,
-)
+from ppo_utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, UnitInterval, bounded
 from ppo_utils.processes import all_gather, average_gradients
 from ppo_utils.runs import Run, command, open_run, prepare, report, report_out_of_memory, run_to_end, training_envs
 
@@ -63,122 +55,115 @@ class Args:
 
     exp_name: str = Path(__file__).stem
     """name of the experiment, part of the run folder's name"""
-    preset: Literal["thesis", "laptop"] = "thesis"
-    """a set of defaults (`PRESETS`) that the command line begins with; flags that are given win over it (in Python:
-    Args(**PRESETS["laptop"]))"""
+    preset: Literal["thesis", "laptop", "quickstart"] = "thesis"
+    """defaults to begin with, listed above; flags that are given win over them"""
     seed: NonNegativeInt = 1
-    """seed of the weights, the actions and the environments: same seed, same curves (on the CPU to the last bit)"""
+    """seed of weights, actions and environments: the same seed gives the same curves (on a CPU bit for bit, with the
+    same number of threads)"""
     torch_deterministic: bool = True
     """ask cuDNN for deterministic algorithms"""
     cuda: bool = True
-    """train on the GPU when there is one"""
+    """train on the GPU if there is one"""
     amp: bool = False
-    """compute encoder and decoder, and a transformer, in bfloat16, faster on processors that have it"""
+    """compute encoder, transformer and decoder in bfloat16"""
     track: bool = False
-    """log to Weights and Biases too (needs the extra `track`; WANDB_PROJECT and WANDB_ENTITY say where)"""
+    """log to Weights and Biases too (extra `track`); WANDB_PROJECT and WANDB_ENTITY name project and team"""
     capture_video: bool = False
-    """record some episodes of the first environment to the run folder (needs the extra `play`)"""
+    """record some episodes of the first environment (extra `play`)"""
     save_model: bool = False
-    """write weights and arguments to model.pt in the run folder when training ends"""
+    """write model.pt to the run folder when training ends"""
     load_model: str | None = None
-    """start from the weights in this file, written by --save-model"""
+    """start from the weights in this file: a model.pt or a checkpoint"""
     resume: str | None = None
-    """go on with the run in this folder from its last checkpoint; other flags may only repeat the run's values, but
-    --total-timesteps may be larger"""
+    """go on with the run in this folder from its last checkpoint; of all flags only --total-timesteps may change, to a
+    larger value"""
     checkpoint_interval: NonNegativeInt = 50
-    """iterations between checkpoints; another one is written when training ends or is stopped, and the last two are
-    kept (0: no checkpoints)"""
+    """iterations between checkpoints, with another one at the end (0: no checkpoints); the last two are kept"""
 
     env_id: str = "MortarMayhem-Grid-v0"
-    """any Gymnasium id with Discrete or MultiDiscrete actions, with its module if that has to be imported first, e.g.
-    minigrid:MiniGrid-MemoryS9-v0"""
+    """any Gymnasium id with Discrete or MultiDiscrete actions; as module:id if importing a module registers it"""
     env_options: str = "{}"
-    """reset parameters of a Memory Gym environment as JSON, e.g. '{"command_count": [4]}'"""
+    """reset options of a Memory Gym environment as JSON, e.g. '{"command_count": [4]}'"""
     num_levels: NonNegativeInt = 100_000
     """number of levels that a Memory Gym environment trains on (0: no limit)"""
     start_level: NonNegativeInt = 0
     """the first of these levels"""
     obs_type: Literal["pixels", "vector"] = "pixels"
-    """what a Memory Gym environment shows: images, or a vector of all that can be seen on them (other environments have
-    one kind of observation)"""
+    """what a Memory Gym environment shows: images, or vectors of what can be seen on them"""
     frame_stack: NonNegativeInt = 0
-    """observe the last so many images at once, in grayscale, or so many vectors (0: the current one, in colour)"""
+    """observe the last K images, in grayscale, or the last K vectors (0: only the current one)"""
     step_encoding: bool = False
-    """observe the number of the episode's step too, as a sinusoidal encoding of width 16"""
+    """also observe a sinusoidal encoding of the episode's step"""
     observe_last_action: bool = False
-    """observe the last action and reward too, as a one-hot vector and a number"""
+    """also observe the last action and the last reward"""
     spotlight_perturbation: bool = False
-    """put a veil over the image, with holes that move as the spotlights of Searing Spotlights do (thesis §7.2)"""
+    """cover the image with a translucent white layer in which moving spotlights leave holes (thesis §7.2)"""
     vector_frequencies: bounded(int, 0, 16) = 0
-    """number of frequencies of the Fourier features that the network gets of a vector with entries from 0 to 1"""
+    """also observe Fourier features of vectors with entries from 0 to 1, at this many frequencies"""
 
     total_timesteps: PositiveInt = 163_840_000
-    """steps to train for, all environments together, rounded down to whole iterations of num_envs x num_steps"""
+    """environment steps to train for, rounded down to whole iterations of num_envs x num_steps"""
     num_envs: PositiveInt = 32
     """environments that run in parallel"""
     num_steps: PositiveInt = 512
-    """steps of each environment in one rollout"""
+    """steps of each environment in a rollout"""
     num_minibatches: PositiveInt = 8
     """minibatches of an epoch"""
     update_epochs: PositiveInt = 3
-    """passes over each rollout"""
+    """epochs of an update"""
     gamma: UnitInterval = 0.995
     """discount factor"""
     gae_lambda: UnitInterval = 0.95
     """lambda of generalized advantage estimation"""
     refresh_memory: bool = False
-    """before every epoch but the first, recompute the memory that the rollout stored, with the current weights; where
-    the update reads none of it, only the next rollout starts from other memory (docs/memory.md)"""
+    """recompute the memory that a rollout stored with the current weights, before each epoch but the first"""
     bootstrap_truncated: bool = False
-    """value the final observation of an episode that a time limit cut short, instead of counting it as ended"""
+    """add the value of the final observation where a time limit ended an episode; without, it counts as terminated"""
     norm_adv: Literal["none", "minibatch", "batch"] = "none"
-    """bring the advantages of each minibatch, or of the whole rollout, to mean 0 and standard deviation 1"""
+    """normalize the advantages of each minibatch, or of the whole rollout, to mean 0 and standard deviation 1"""
     clip_coef: PositiveFloat = 0.1
-    """how far the probability ratio may move from 1, and the value from the rollout's"""
+    """clipping range of the probability ratio and of the value"""
     clip_vloss: bool = True
-    """clip the value loss too"""
+    """clip the value loss"""
     vf_coef: NonNegativeFloat = 0.5
     """weight of the value loss"""
     max_grad_norm: PositiveFloat = 0.25
-    """a gradient with a larger norm is scaled down to this one"""
+    """largest norm of the gradient, which is scaled down to it"""
     target_kl: PositiveFloat | None = None
-    """end an iteration's update at the first minibatch whose KL divergence from the policy that acted exceeds this,
-    which is neither learned from nor logged"""
+    """end the update before the first minibatch whose KL divergence from the policy that acted is larger"""
     init_lr: UnitInterval = 2.75e-4
-    """learning rate at the first step"""
+    """learning rate at first"""
     final_lr: UnitInterval = 1.0e-5
-    """learning rate from step --anneal-steps on"""
+    """learning rate from --anneal-steps on"""
     exploration_bonus: Literal["entropy", "log-barrier"] = "entropy"
-    """what keeps the policy exploring: its entropy, or the mean log-probability of all actions, which also brings back
-    an action whose probability has vanished"""
+    """what keeps the policy exploring: its entropy, or the mean log-probability of all actions"""
     init_ent_coef: NonNegativeFloat = 1.0e-4
-    """weight of the exploration bonus at the first step"""
+    """weight of the exploration bonus at first"""
     final_ent_coef: NonNegativeFloat = 1.0e-6
-    """weight of the exploration bonus from step --anneal-steps on"""
+    """weight of the exploration bonus from --anneal-steps on"""
     anneal_steps: NonNegativeInt = 163_840_000
-    """steps over which learning rate and exploration bonus decay linearly (0: they keep their initial values)"""
+    """steps over which learning rate and exploration bonus decay linearly (0: they stay as at first)"""
     reconstruction_coef: NonNegativeFloat = 0.0
-    """weight of the loss of reconstructing the image from the memory's output (0: off; the thesis has 0.1)"""
+    """weight of the loss of reconstructing the observed image (0: off; thesis: 0.1)"""
     reconstruction_detach: bool = False
-    """reconstruct the image without teaching the agent: a probe of what the memory's output tells of it"""
+    """train the decoder alone: no gradient of this loss reaches the agent"""
     ground_truth_coef: NonNegativeFloat = 0.0
-    """weight of the loss of estimating the environment's ground truth (0: off; the thesis has 0.1)"""
+    """weight of the loss of estimating the environment's ground truth (0: off; thesis: 0.1)"""
     ground_truth_detach: bool = False
-    """estimate the ground truth without teaching the agent: a probe of what its memory holds"""
+    """train the estimator alone: no gradient of this loss reaches the agent"""
     embedding: bool = True
-    """embed the encoded observation in the memory's width; without, the memory takes it as it is (in ppo_trxl.py
-    only if --trxl-dim is its width)"""
-    head_size: PositiveInt = 512
-    """width of the layer after the memory, and of the heads' own layers"""
+    """embed the encoded observation in the memory's width"""
+    trunk_size: PositiveInt = 512
+    """width of the layer after the memory, and of the hidden layers of policy and value"""
     value_init_gain: NonNegativeFloat = 1.0
-    """gain of the value's last layer at initialization: below 1, values begin nearer to 0"""
+    """gain of the value's last layer at initialization: the smaller, the nearer to 0 are fresh values"""
 
     eval_interval: NonNegativeInt = 0
-    """iterations from one evaluation to the next, and one at the end, on levels that are not trained on (0: none)"""
+    """iterations between evaluations on unseen levels, with another one at the end (0: no evaluations)"""
     eval_levels: PositiveInt = 50
     """levels of an evaluation, from start_level + num_levels on; each is played three times"""
     eval_max_steps: PositiveInt = 10_000
-    """steps after which an evaluation cuts an endless episode short"""
+    """steps after which an evaluation cuts an episode short"""
 
     memory: Literal["gru", "lstm", "none"] = "gru"
     """what the agent remembers with"""
@@ -187,30 +172,38 @@ class Args:
     num_layers: PositiveInt = 1
     """stacked recurrent layers"""
     seq_len: NonNegativeInt = 0
-    """longest sequence that the gradient flows through (0: the longest episode in the rollout)"""
+    """longest sequence that the gradient flows through (0: up to the whole rollout)"""
 
 
-PRESETS = {
-    "thesis": {},  # the defaults above
-    "laptop": {
-        "obs_type": "vector",
-        "hidden_size": 128,
-        "head_size": 128,
-        "num_steps": 128,
-        "update_epochs": 4,
-        "gamma": 0.99,
-        "clip_coef": 0.2,
-        "max_grad_norm": 0.5,
-        "target_kl": 0.05,
-        "init_lr": 1e-3,
-        "final_lr": 1e-4,
-        "exploration_bonus": "log-barrier",
-        "init_ent_coef": 5e-4,
-        "final_ent_coef": 5e-5,
-        "anneal_steps": 1_000_000,
-        "total_timesteps": 1_000_000,
-    },
+LAPTOP = {
+    "preset": "laptop",
+    "obs_type": "vector",
+    "hidden_size": 128,
+    "trunk_size": 128,
+    "num_steps": 128,
+    "update_epochs": 4,
+    "gamma": 0.99,
+    "clip_coef": 0.2,
+    "max_grad_norm": 0.5,
+    "target_kl": 0.05,
+    "init_lr": 1e-3,
+    "final_lr": 1e-4,
+    "exploration_bonus": "log-barrier",
+    "init_ent_coef": 5e-4,
+    "final_ent_coef": 5e-5,
+    "anneal_steps": 1_000_000,
+    "total_timesteps": 1_000_000,
 }
+QUICKSTART = {
+    **LAPTOP,
+    "preset": "quickstart",
+    # Two commands, each shown for one step, and six steps to carry one out.
+    "env_options": '{"command_count": [2], "command_show_duration": [1], "command_show_delay": [0], '
+    '"explosion_delay": [4], "explosion_duration": [2]}',
+    "anneal_steps": 500_000,
+    "total_timesteps": 500_000,
+}
+PRESETS = {"thesis": {}, "laptop": LAPTOP, "quickstart": QUICKSTART}  # thesis: the defaults above
 
 
 # ---- 2 TRAINING ----
@@ -230,16 +223,7 @@ def train(args: Args, run: Run) -> None:
 
         last_value, episodes = collect(agent, run.envs, rollout, args)
         collected = time.perf_counter()
-        rollout.advantages = gae(
-            rollout.rewards,
-            rollout.values,
-            last_value,
-            rollout.terminated,
-            rollout.truncated,
-            rollout.truncation_values,
-            args.gamma,
-            args.gae_lambda,
-        )
+        rollout.advantages = gae(rollout, last_value, args.gamma, args.gae_lambda)
         rollout.returns = rollout.advantages + rollout.values
         logs = mean_logs(update(agent, run.optimizer, rollout, ent_coef, args), rollout)
         updated = time.perf_counter()
@@ -255,7 +239,7 @@ def train(args: Args, run: Run) -> None:
 
 @dataclass
 class Rollout:
-    """T steps of N environments to learn from, and what the next rollout goes on with; each rollout overwrites it."""
+    """T steps of N environments to learn from, and what the next rollout goes on with. Each one overwrites the last."""
 
     obs: dict[str, Tensor]  # each (T, N, ...): uint8 pixels stay uint8
     actions: Tensor  # (T, N, A)
@@ -308,8 +292,7 @@ def collect(
 ) -> tuple[Tensor, dict[str, list[float]]]:
     """Act for T steps in all environments; return the value (N,) of what follows, and metrics of the ended episodes.
 
-    The environments are those of `ppo_utils.environments`: an observation is a dict of images and vectors, and an ended
-    episode is reset in the same step, so that next_obs begins the next one. Metrics are lists by name:
+    An ended episode is reset in the same step, so that next_obs begins the next one. Metrics are lists by name:
     charts/episodic_return, charts/episodic_length, and episode/* for every number in the environment's final info.
     """
     device, memory = rollout.values.device, rollout.memory
@@ -383,9 +366,8 @@ def ppo_loss(
     autocast = torch.autocast(index.device.type, torch.bfloat16, enabled=args.amp)
     with autocast:
         x = encode(agent.encoder, rollout.obs, index, rollout.first_occurrence)  # (B, I)
-        policy, log_probs, values, features = agent.evaluate_actions(
-            x, gather(rollout.actions), minibatch, rollout.memory
-        )
+        actions = gather(rollout.actions)  # (B, A)
+        policy, log_probs, values, features = agent.evaluate_actions(x, actions, minibatch, rollout.memory)
     log_ratio = log_probs - gather(rollout.log_probs)  # (B, A)
     advantages, old_values, returns = gather(rollout.advantages), gather(rollout.values), gather(rollout.returns)
     if args.norm_adv == "minibatch":
@@ -428,16 +410,14 @@ def refresh_memory(agent: Agent, rollout: Rollout, args: Args) -> None:
 def clip_gradients(agent: Agent, args: Args) -> Tensor:
     """Scale the gradient down to --max-grad-norm if its norm is larger; return the norm.
 
-    A detached head is a probe of what the features hold. It is clipped by itself: a share in the agent's norm would
-    change the agent's step.
+    A detached head is clipped by itself: a share in the agent's norm would change the agent's step.
     """
-    auxiliary = ((agent.decoder, args.reconstruction_detach), (agent.estimator, args.ground_truth_detach))
-    probes = [[*network.parameters()] for network, detached in auxiliary if network is not None and detached]
-    for probe in probes:
-        nn.utils.clip_grad_norm_(probe, args.max_grad_norm)
-    of_probes = {parameter for probe in probes for parameter in probe}
-    others = [parameter for parameter in agent.parameters() if parameter not in of_probes]
-    return nn.utils.clip_grad_norm_(others, args.max_grad_norm)
+    own = {*agent.parameters()}
+    for head, detached in ((agent.decoder, args.reconstruction_detach), (agent.estimator, args.ground_truth_detach)):
+        if head is not None and detached:
+            nn.utils.clip_grad_norm_(head.parameters(), args.max_grad_norm)
+            own -= {*head.parameters()}
+    return nn.utils.clip_grad_norm_([each for each in agent.parameters() if each in own], args.max_grad_norm)
 
 
 def mean_logs(steps: list[dict[str, Tensor]], rollout: Rollout) -> dict[str, float]:
@@ -461,25 +441,16 @@ def anneal(step: int, initial: float, final: float, anneal_steps: int) -> float:
     return initial + fraction * (final - initial)
 
 
-def gae(
-    rewards: Tensor,
-    values: Tensor,
-    last_value: Tensor,
-    terminated: Tensor,
-    truncated: Tensor,
-    truncation_values: Tensor,
-    gamma: float,
-    gae_lambda: float,
-) -> Tensor:
+def gae(rollout: Rollout, last_value: Tensor, gamma: float, gae_lambda: float) -> Tensor:
     """Return the advantages (T, N) of generalized advantage estimation (2.34), cut wherever an episode ends.
 
-    last_value (N,) is the value of the observation after the last step. truncation_values (T, N) holds the value of
-    the final observation where a truncated episode is bootstrapped and zero elsewhere; a terminated one never is.
+    last_value (N,) is the value of the observation after the last step. Where an episode is truncated, what follows is
+    worth its truncation value, which is zero unless the final observation is bootstrapped; where it terminated, zero.
     """
-    done = terminated | truncated
-    next_values = torch.cat([values[1:], last_value[None]])  # (T, N)
-    next_values = torch.where(done, truncation_values * ~terminated, next_values)
-    deltas = rewards + gamma * next_values - values
+    done = rollout.terminated | rollout.truncated
+    next_values = torch.cat([rollout.values[1:], last_value[None]])  # (T, N)
+    next_values = torch.where(done, rollout.truncation_values * ~rollout.terminated, next_values)
+    deltas = rollout.rewards + gamma * next_values - rollout.values
     decay = gamma * gae_lambda * ~done
     advantages = torch.empty_like(deltas)
     advantage = torch.zeros_like(last_value)
@@ -516,9 +487,8 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: f
 def log_barrier(policy: list[Categorical]) -> Tensor:
     """Return the mean log-probability of all actions, not only of those taken: over samples, summed over branches.
 
-    It is largest for a uniform policy. Where an action's probability is near 0, the gradients of the surrogate loss and
-    of the entropy are near 0 too; that of the log barrier is not (Agarwal et al., On the Theory of Policy Gradient
-    Methods, 2021).
+    It is largest for a uniform policy. Near probability 0 the gradients of surrogate loss and entropy vanish, but that
+    of the log barrier does not (Agarwal et al., On the Theory of Policy Gradient Methods, 2021).
     """
     return sum(branch.logits.mean() for branch in policy)  # a Categorical's logits are normalized
 
@@ -603,12 +573,14 @@ class Pieces:
         return y.flatten(0, 1).index_select(0, steps.to(y.device))
 
     def minibatches(self, count: int) -> Iterator[Pieces]:
-        """Shuffle the pieces, and distribute them, whole, over count minibatches of about the same number of steps."""
+        """Shuffle the pieces, and distribute them, whole, over count minibatches of about the same number of steps.
+
+        No minibatch is empty: `check_minibatches` makes sure that no piece is longer than a minibatch's share.
+        """
         order = torch.randperm(len(self.first))
         first, length = self.first[order], self.length[order]
-        # (S,) the minibatch of each piece, by the position of its first step. No minibatch is empty: `check_args` makes
-        # sure that no piece is longer than a minibatch's share of the steps.
-        minibatch = (length.cumsum(0) - length) * count // length.sum()
+        twice_middle = 2 * length.cumsum(0) - length
+        minibatch = twice_middle * count // (2 * length.sum())  # (S,) of each piece, by the position of its middle
         sizes = minibatch.bincount(minlength=count).tolist()
         for mb_first, mb_length in zip(first.split(sizes), length.split(sizes), strict=True):
             yield Pieces(mb_first, mb_length, self.num_envs)
@@ -639,7 +611,7 @@ class Memory(nn.Module):
     for the LSTM, none without memory. Raises ValueError for flags that would change nothing without memory.
     """
 
-    flags = ("memory", "hidden_size", "num_layers")  # that a model's weights depend on
+    flags = ("memory", "hidden_size", "num_layers")  # with other values, the same weights are another network
 
     def __init__(self, args: Args, inputs: int):
         super().__init__()
@@ -758,36 +730,20 @@ class AtariCNN(nn.Sequential):
         return features.permute(0, 2, 3, 1).flatten(1)  # in the order they have in memory: no copy
 
 
-def fourier_features(x: Tensor, frequencies: int) -> Tensor:
-    """Append sines and cosines of x (B, V) at pi, 2 pi, 4 pi ...: (B, V (1 + 2 frequencies)).
-
-    They magnify small differences, so that a network learns sooner to tell values apart (Tancik et al., 2020).
-    """
-    angles = x[..., None] * (math.pi * 2 ** torch.arange(frequencies, device=x.device))  # (B, V, frequencies)
-    return torch.cat([x, angles.sin().flatten(1), angles.cos().flatten(1)], -1)
-
-
 class Encoder(nn.Module):
-    """Encodes each part of an observation, concatenates the features and embeds them in `width` (§5.1), unless None.
+    """Encodes the images and vectors of an observation, and embeds them together in `width` (§5.1), unless None."""
 
-    Raises ValueError for frequencies without a vector to take them of.
-    """
-
-    def __init__(self, spaces: dict[str, gym.spaces.Box], width: int | None, frequencies: int):
+    def __init__(self, spaces: dict[str, gym.spaces.Box], width: int | None):
         super().__init__()
-        self.frequencies = frequencies
         self.images = [name for name, space in spaces.items() if len(space.shape) == 3]
         self.vectors = [name for name, space in spaces.items() if len(space.shape) == 1]
         self.cnns = nn.ModuleList(AtariCNN(spaces[name].shape[2]) for name in self.images)
         with torch.no_grad():
             blank = [torch.zeros(1, *spaces[name].shape) for name in self.images]
-            features = sum(cnn(x).shape[1] for cnn, x in zip(self.cnns, blank, strict=True))
+            features = sum(cnn(image).shape[1] for cnn, image in zip(self.cnns, blank, strict=True))
         if self.vectors:
-            entries = sum(spaces[name].shape[0] for name in self.vectors)
-            self.mlp = layer_init(nn.Linear(entries * (1 + 2 * frequencies), 128))
+            self.mlp = layer_init(nn.Linear(sum(spaces[name].shape[0] for name in self.vectors), 128))
             features += 128
-        elif frequencies:
-            raise ValueError("--vector-frequencies needs an observation with a vector; use 0")
         self.width = features if width is None else width
         self.embedding = None if width is None else layer_init(nn.Linear(features, width))
 
@@ -795,8 +751,7 @@ class Encoder(nn.Module):
         """Encode observations, each part (B, ...), to (B, self.width)."""
         features = [in_chunks(cnn, obs[name]) for cnn, name in zip(self.cnns, self.images, strict=True)]
         if self.vectors:
-            vector = torch.cat([obs[name] for name in self.vectors], -1)
-            features.append(F.relu(self.mlp(fourier_features(vector, self.frequencies))))
+            features.append(F.relu(self.mlp(torch.cat([obs[name] for name in self.vectors], -1))))
         x = torch.cat(features, -1)
         if self.embedding is not None:
             x = F.relu(self.embedding(x))
@@ -832,27 +787,18 @@ def head(size: int, outputs: int, gain: float) -> nn.Sequential:
 
 
 class Decoder(nn.Sequential):
-    """The transposed Atari CNN, which reconstructs the observed image (§5.1.2, table 6.2).
+    """The transposed Atari CNN: reconstructs an image of shape (height, width, channels) (§5.1.2, table 6.2)."""
 
-    Raises ValueError unless the observation has one image.
-    """
-
-    def __init__(self, features: int, spaces: dict[str, gym.spaces.Box]):
-        images = [space.shape for space in spaces.values() if len(space.shape) == 3]
-        if len(images) != 1:
-            raise ValueError(f"--reconstruction-coef needs an observation with one image, not {len(images)}; use 0")
-        height, width, channels = images[0]
-        sizes = [(height, width)]  # of the image and of each convolution's output
+    def __init__(self, features: int, shape: tuple[int, int, int]):
+        *size, channels = shape  # of the image, then of each convolution's output
+        output_padding = []  # pixels at the right and lower edge that a convolution does not reach
         for kernel, stride in ((8, 4), (4, 2), (3, 1)):
-            sizes.append(tuple((size - kernel) // stride + 1 for size in sizes[-1]))
-        # Pixels at the right and lower edge that the encoder's first two strides do not reach.
-        output_padding = [
-            [(size - kernel) % stride for size in sizes[i]] for i, (kernel, stride) in enumerate(((8, 4), (4, 2)))
-        ]
+            output_padding.append([(side - kernel) % stride for side in size])
+            size = [(side - kernel) // stride + 1 for side in size]
         super().__init__(
-            layer_init(nn.Linear(features, 64 * math.prod(sizes[3]))),
+            layer_init(nn.Linear(features, 64 * math.prod(size))),
             nn.ReLU(inplace=True),
-            nn.Unflatten(1, (64, *sizes[3])),
+            nn.Unflatten(1, (64, *size)),
             layer_init(nn.ConvTranspose2d(64, 64, 3, 1)),
             nn.ReLU(inplace=True),
             layer_init(nn.ConvTranspose2d(64, 32, 4, 2, output_padding=output_padding[1])),
@@ -874,13 +820,15 @@ class Agent(nn.Module):
 
     def __init__(self, space: gym.spaces.Dict, nvec: list[int], args: Args, ground_truth_size: int = 0):
         super().__init__()
-        width = Memory.input_width(args) if args.embedding else None
-        self.encoder = Encoder(space.spaces, width, args.vector_frequencies)
+        self.encoder = Encoder(space.spaces, Memory.input_width(args) if args.embedding else None)
         self.memory = Memory(args, self.encoder.width)
-        self.heads = Heads(self.memory.width, nvec, args.head_size, args.value_init_gain)
+        self.heads = Heads(self.memory.width, nvec, args.trunk_size, args.value_init_gain)
+        images = [space[name].shape for name in self.encoder.images]
+        if args.reconstruction_coef and len(images) != 1:
+            raise ValueError(f"--reconstruction-coef needs an observation with one image, not {len(images)}; use 0")
         with torch.random.fork_rng([]):  # with and without these, the random numbers that follow are the same
-            self.decoder = Decoder(args.head_size, space.spaces) if args.reconstruction_coef else None
-            self.estimator = head(args.head_size, ground_truth_size, 1.0) if args.ground_truth_coef else None
+            self.decoder = Decoder(args.trunk_size, images[0]) if args.reconstruction_coef else None
+            self.estimator = head(args.trunk_size, ground_truth_size, 1.0) if args.ground_truth_coef else None
 
     def get_action_and_value(self, obs: dict[str, Tensor], memory: MemoryState) -> tuple[Tensor, Tensor, Tensor]:
         """Take one step of all environments, which the memory's state stores.
@@ -925,8 +873,7 @@ def setup(args: Args) -> Run:
     with one line for the user.
     """
     script = Path(__file__).stem
-    device, checkpoint = prepare(args, script)
-    check_minibatches(args, Memory.longest_piece(args))
+    device, checkpoint = prepare(args, script, Memory.longest_piece(args))
     with report_out_of_memory(args, device):
         envs = training_envs(args, checkpoint)
         obs, infos = envs.reset()

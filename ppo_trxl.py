@@ -5,14 +5,13 @@
 The agent gets one observation at a time. Every step stores its hidden states: the inputs of the transformer's blocks.
 Each block of a later step attends to those of the last --trxl-memory-length steps of the episode, the window. They are
 stored without gradient, computed with the weights that acted. --trxl-memory-gradient computes those of the same segment
-again, with gradient; --refresh-memory computes those of the rollout again, without gradient, before each epoch but the
-first.
+again, with gradient; --refresh-memory those of the rollout, without gradient, before each epoch but the first.
 
 A window is never gathered for every query. While acting, a hidden state is projected to its key and value once, into a
-cache that is computed again after each update. For the update, the steps of an environment's rollout and the window
-before them form a timeline, which is cut into segments of --trxl-segment-length steps. The queries of a segment attend
-to its own hidden states and to the window before it, which are projected once per segment, under one band mask: each
-query attends to the earlier steps of its own episode within the window.
+cache that is computed again after each update. For the update, an environment's rollout and the window before it form a
+timeline, which is cut into segments of --trxl-segment-length steps. The queries of a segment attend to its own steps
+and to the window before it, all projected once, under one band mask: each query attends to the earlier steps of its own
+episode within the window.
 
 Source: "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", called the thesis below.
 §5.3 is its section, (5.7) its equation; defaults are the "Final" column of its table 6.1, without auxiliary losses.
@@ -47,15 +46,7 @@ from torch.nn.utils.rnn import pad_sequence
 from ppo_utils.checkpoints import make_agent
 from ppo_utils.environments import as_tensors, final_numbers, final_observations, ground_truth_of
 from ppo_utils.fast import encode, first_occurrences, in_chunks
-from ppo_utils.flags import (
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    UnitInterval,
-    bounded,
-    check_minibatches,
-)
+from ppo_utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, UnitInterval, bounded
 from ppo_utils.processes import all_gather, average_gradients
 from ppo_utils.runs import Run, command, open_run, prepare, report, report_out_of_memory, run_to_end, training_envs
 
@@ -67,122 +58,115 @@ class Args:
 
     exp_name: str = Path(__file__).stem
     """name of the experiment, part of the run folder's name"""
-    preset: Literal["thesis", "laptop"] = "thesis"
-    """a set of defaults (`PRESETS`) that the command line begins with; flags that are given win over it (in Python:
-    Args(**PRESETS["laptop"]))"""
+    preset: Literal["thesis", "laptop", "quickstart"] = "thesis"
+    """defaults to begin with, listed above; flags that are given win over them"""
     seed: NonNegativeInt = 1
-    """seed of the weights, the actions and the environments: same seed, same curves (on the CPU to the last bit)"""
+    """seed of weights, actions and environments: the same seed gives the same curves (on a CPU bit for bit, with the
+    same number of threads)"""
     torch_deterministic: bool = True
     """ask cuDNN for deterministic algorithms"""
     cuda: bool = True
-    """train on the GPU when there is one"""
+    """train on the GPU if there is one"""
     amp: bool = False
-    """compute encoder and decoder, and a transformer, in bfloat16, faster on processors that have it"""
+    """compute encoder, transformer and decoder in bfloat16"""
     track: bool = False
-    """log to Weights and Biases too (needs the extra `track`; WANDB_PROJECT and WANDB_ENTITY say where)"""
+    """log to Weights and Biases too (extra `track`); WANDB_PROJECT and WANDB_ENTITY name project and team"""
     capture_video: bool = False
-    """record some episodes of the first environment to the run folder (needs the extra `play`)"""
+    """record some episodes of the first environment (extra `play`)"""
     save_model: bool = False
-    """write weights and arguments to model.pt in the run folder when training ends"""
+    """write model.pt to the run folder when training ends"""
     load_model: str | None = None
-    """start from the weights in this file, written by --save-model"""
+    """start from the weights in this file: a model.pt or a checkpoint"""
     resume: str | None = None
-    """go on with the run in this folder from its last checkpoint; other flags may only repeat the run's values, but
-    --total-timesteps may be larger"""
+    """go on with the run in this folder from its last checkpoint; of all flags only --total-timesteps may change, to a
+    larger value"""
     checkpoint_interval: NonNegativeInt = 50
-    """iterations between checkpoints; another one is written when training ends or is stopped, and the last two are
-    kept (0: no checkpoints)"""
+    """iterations between checkpoints, with another one at the end (0: no checkpoints); the last two are kept"""
 
     env_id: str = "MortarMayhem-Grid-v0"
-    """any Gymnasium id with Discrete or MultiDiscrete actions, with its module if that has to be imported first, e.g.
-    minigrid:MiniGrid-MemoryS9-v0"""
+    """any Gymnasium id with Discrete or MultiDiscrete actions; as module:id if importing a module registers it"""
     env_options: str = "{}"
-    """reset parameters of a Memory Gym environment as JSON, e.g. '{"command_count": [4]}'"""
+    """reset options of a Memory Gym environment as JSON, e.g. '{"command_count": [4]}'"""
     num_levels: NonNegativeInt = 100_000
     """number of levels that a Memory Gym environment trains on (0: no limit)"""
     start_level: NonNegativeInt = 0
     """the first of these levels"""
     obs_type: Literal["pixels", "vector"] = "pixels"
-    """what a Memory Gym environment shows: images, or a vector of all that can be seen on them (other environments have
-    one kind of observation)"""
+    """what a Memory Gym environment shows: images, or vectors of what can be seen on them"""
     frame_stack: NonNegativeInt = 0
-    """observe the last so many images at once, in grayscale, or so many vectors (0: the current one, in colour)"""
+    """observe the last K images, in grayscale, or the last K vectors (0: only the current one)"""
     step_encoding: bool = False
-    """observe the number of the episode's step too, as a sinusoidal encoding of width 16"""
+    """also observe a sinusoidal encoding of the episode's step"""
     observe_last_action: bool = False
-    """observe the last action and reward too, as a one-hot vector and a number"""
+    """also observe the last action and the last reward"""
     spotlight_perturbation: bool = False
-    """put a veil over the image, with holes that move as the spotlights of Searing Spotlights do (thesis §7.2)"""
+    """cover the image with a translucent white layer in which moving spotlights leave holes (thesis §7.2)"""
     vector_frequencies: bounded(int, 0, 16) = 0
-    """number of frequencies of the Fourier features that the network gets of a vector with entries from 0 to 1"""
+    """also observe Fourier features of vectors with entries from 0 to 1, at this many frequencies"""
 
     total_timesteps: PositiveInt = 163_840_000
-    """steps to train for, all environments together, rounded down to whole iterations of num_envs x num_steps"""
+    """environment steps to train for, rounded down to whole iterations of num_envs x num_steps"""
     num_envs: PositiveInt = 32
     """environments that run in parallel"""
     num_steps: PositiveInt = 512
-    """steps of each environment in one rollout"""
+    """steps of each environment in a rollout"""
     num_minibatches: PositiveInt = 8
     """minibatches of an epoch"""
     update_epochs: PositiveInt = 3
-    """passes over each rollout"""
+    """epochs of an update"""
     gamma: UnitInterval = 0.995
     """discount factor"""
     gae_lambda: UnitInterval = 0.95
     """lambda of generalized advantage estimation"""
     refresh_memory: bool = False
-    """before every epoch but the first, recompute the memory that the rollout stored, with the current weights; where
-    the update reads none of it, only the next rollout starts from other memory (docs/memory.md)"""
+    """recompute the memory that a rollout stored with the current weights, before each epoch but the first"""
     bootstrap_truncated: bool = False
-    """value the final observation of an episode that a time limit cut short, instead of counting it as ended"""
+    """add the value of the final observation where a time limit ended an episode; without, it counts as terminated"""
     norm_adv: Literal["none", "minibatch", "batch"] = "none"
-    """bring the advantages of each minibatch, or of the whole rollout, to mean 0 and standard deviation 1"""
+    """normalize the advantages of each minibatch, or of the whole rollout, to mean 0 and standard deviation 1"""
     clip_coef: PositiveFloat = 0.1
-    """how far the probability ratio may move from 1, and the value from the rollout's"""
+    """clipping range of the probability ratio and of the value"""
     clip_vloss: bool = True
-    """clip the value loss too"""
+    """clip the value loss"""
     vf_coef: NonNegativeFloat = 0.5
     """weight of the value loss"""
     max_grad_norm: PositiveFloat = 0.25
-    """a gradient with a larger norm is scaled down to this one"""
+    """largest norm of the gradient, which is scaled down to it"""
     target_kl: PositiveFloat | None = None
-    """end an iteration's update at the first minibatch whose KL divergence from the policy that acted exceeds this,
-    which is neither learned from nor logged"""
+    """end the update before the first minibatch whose KL divergence from the policy that acted is larger"""
     init_lr: UnitInterval = 2.75e-4
-    """learning rate at the first step"""
+    """learning rate at first"""
     final_lr: UnitInterval = 1.0e-5
-    """learning rate from step --anneal-steps on"""
+    """learning rate from --anneal-steps on"""
     exploration_bonus: Literal["entropy", "log-barrier"] = "entropy"
-    """what keeps the policy exploring: its entropy, or the mean log-probability of all actions, which also brings back
-    an action whose probability has vanished"""
+    """what keeps the policy exploring: its entropy, or the mean log-probability of all actions"""
     init_ent_coef: NonNegativeFloat = 1.0e-4
-    """weight of the exploration bonus at the first step"""
+    """weight of the exploration bonus at first"""
     final_ent_coef: NonNegativeFloat = 1.0e-6
-    """weight of the exploration bonus from step --anneal-steps on"""
+    """weight of the exploration bonus from --anneal-steps on"""
     anneal_steps: NonNegativeInt = 163_840_000
-    """steps over which learning rate and exploration bonus decay linearly (0: they keep their initial values)"""
+    """steps over which learning rate and exploration bonus decay linearly (0: they stay as at first)"""
     reconstruction_coef: NonNegativeFloat = 0.0
-    """weight of the loss of reconstructing the image from the memory's output (0: off; the thesis has 0.1)"""
+    """weight of the loss of reconstructing the observed image (0: off; thesis: 0.1)"""
     reconstruction_detach: bool = False
-    """reconstruct the image without teaching the agent: a probe of what the memory's output tells of it"""
+    """train the decoder alone: no gradient of this loss reaches the agent"""
     ground_truth_coef: NonNegativeFloat = 0.0
-    """weight of the loss of estimating the environment's ground truth (0: off; the thesis has 0.1)"""
+    """weight of the loss of estimating the environment's ground truth (0: off; thesis: 0.1)"""
     ground_truth_detach: bool = False
-    """estimate the ground truth without teaching the agent: a probe of what its memory holds"""
+    """train the estimator alone: no gradient of this loss reaches the agent"""
     embedding: bool = True
-    """embed the encoded observation in the memory's width; without, the memory takes it as it is (in ppo_trxl.py
-    only if --trxl-dim is its width)"""
-    head_size: PositiveInt = 512
-    """width of the layer after the memory, and of the heads' own layers"""
+    """embed the encoded observation in the memory's width"""
+    trunk_size: PositiveInt = 512
+    """width of the layer after the memory, and of the hidden layers of policy and value"""
     value_init_gain: NonNegativeFloat = 1.0
-    """gain of the value's last layer at initialization: below 1, values begin nearer to 0"""
+    """gain of the value's last layer at initialization: the smaller, the nearer to 0 are fresh values"""
 
     eval_interval: NonNegativeInt = 0
-    """iterations from one evaluation to the next, and one at the end, on levels that are not trained on (0: none)"""
+    """iterations between evaluations on unseen levels, with another one at the end (0: no evaluations)"""
     eval_levels: PositiveInt = 50
     """levels of an evaluation, from start_level + num_levels on; each is played three times"""
     eval_max_steps: PositiveInt = 10_000
-    """steps after which an evaluation cuts an endless episode short"""
+    """steps after which an evaluation cuts an episode short"""
 
     trxl_num_layers: PositiveInt = 3
     """blocks of the transformer"""
@@ -191,55 +175,62 @@ class Args:
     trxl_dim: PositiveInt = 384
     """width of the blocks"""
     trxl_memory_length: PositiveInt = 256
-    """window: how many steps an agent looks back at, at most (never further than its episode's first)"""
+    """window: the most steps back that a query attends to, within its episode"""
     trxl_positional_encoding: Literal["absolute", "learned", "relative", "none"] = "absolute"
-    """what tells the order of the steps that are looked back at"""
+    """what tells the order of the steps that are attended to"""
     trxl_query_position: bool = False
     """add the encoding of its own step to the first block's query: the learned one, or else the absolute one"""
     trxl_query_output: bool = False
-    """add a projection of the last block's output of the step before to the first block's query, without gradient"""
+    """add a projection of the last block's output at the step before to the first block's query, without gradient"""
     trxl_pe_length: PositiveInt = 2048
-    """longest episode that a learned encoding is made for"""
+    """steps that a learned encoding tells apart; later ones share its last entry"""
     trxl_segment_length: PositiveInt = 128
     """steps of one environment that the update computes at once; minibatches are made of such segments"""
     trxl_memory_gradient: bool = False
-    """let the gradient flow through the block inputs of a segment's earlier steps, computed again in the update, where
-    stored ones are detached"""
+    """attend to the recomputed, not the stored, hidden states of a segment's earlier steps, with gradient"""
     trxl_init: Literal["xavier", "orthogonal", "kaiming", "tfixup"] = "xavier"
-    """how the blocks' weights are initialized"""
+    """initialization of the blocks' weights"""
     trxl_layer_norm: Literal["pre", "post"] = "pre"
-    """where a block normalizes: before attention and projection, or after each is merged with its input"""
+    """layer norms before attention and projection, or after each is merged with its input"""
     trxl_gate: Literal["none", "gru"] = "none"
     """what merges a layer's output with its input: residual connections (TrXL) or gates (GTrXL)"""
     trxl_gate_bias: bounded(float, -100, 100) = 0.0
-    """above 0 a gate mostly keeps the layer's input at first, not its output"""
+    """bias of the gates: above 0, a gate mostly keeps its input at first"""
 
 
-PRESETS = {
-    "thesis": {},  # the defaults above
-    "laptop": {
-        "obs_type": "vector",
-        "trxl_num_layers": 2,
-        "trxl_dim": 64,
-        "trxl_memory_length": 128,
-        "trxl_query_position": True,
-        "trxl_memory_gradient": True,
-        "head_size": 128,
-        "num_steps": 128,
-        "update_epochs": 4,
-        "gamma": 0.99,
-        "clip_coef": 0.2,
-        "max_grad_norm": 0.5,
-        "target_kl": 0.05,
-        "init_lr": 1e-3,
-        "final_lr": 1e-4,
-        "exploration_bonus": "log-barrier",
-        "init_ent_coef": 5e-4,
-        "final_ent_coef": 5e-5,
-        "anneal_steps": 1_000_000,
-        "total_timesteps": 1_000_000,
-    },
+LAPTOP = {
+    "preset": "laptop",
+    "obs_type": "vector",
+    "trxl_num_layers": 2,
+    "trxl_dim": 64,
+    "trxl_memory_length": 128,
+    "trxl_query_position": True,
+    "trxl_memory_gradient": True,
+    "trunk_size": 128,
+    "num_steps": 128,
+    "update_epochs": 4,
+    "gamma": 0.99,
+    "clip_coef": 0.2,
+    "max_grad_norm": 0.5,
+    "target_kl": 0.05,
+    "init_lr": 1e-3,
+    "final_lr": 1e-4,
+    "exploration_bonus": "log-barrier",
+    "init_ent_coef": 5e-4,
+    "final_ent_coef": 5e-5,
+    "anneal_steps": 1_000_000,
+    "total_timesteps": 1_000_000,
 }
+QUICKSTART = {
+    **LAPTOP,
+    "preset": "quickstart",
+    # Two commands, each shown for one step, and six steps to carry one out.
+    "env_options": '{"command_count": [2], "command_show_duration": [1], "command_show_delay": [0], '
+    '"explosion_delay": [4], "explosion_duration": [2]}',
+    "anneal_steps": 500_000,
+    "total_timesteps": 500_000,
+}
+PRESETS = {"thesis": {}, "laptop": LAPTOP, "quickstart": QUICKSTART}  # thesis: the defaults above
 
 
 # ---- 2 TRAINING ----
@@ -259,16 +250,7 @@ def train(args: Args, run: Run) -> None:
 
         last_value, episodes = collect(agent, run.envs, rollout, args)
         collected = time.perf_counter()
-        rollout.advantages = gae(
-            rollout.rewards,
-            rollout.values,
-            last_value,
-            rollout.terminated,
-            rollout.truncated,
-            rollout.truncation_values,
-            args.gamma,
-            args.gae_lambda,
-        )
+        rollout.advantages = gae(rollout, last_value, args.gamma, args.gae_lambda)
         rollout.returns = rollout.advantages + rollout.values
         logs = mean_logs(update(agent, run.optimizer, rollout, ent_coef, args), rollout)
         updated = time.perf_counter()
@@ -284,7 +266,7 @@ def train(args: Args, run: Run) -> None:
 
 @dataclass
 class Rollout:
-    """T steps of N environments to learn from, and what the next rollout goes on with; each rollout overwrites it."""
+    """T steps of N environments to learn from, and what the next rollout goes on with. Each one overwrites the last."""
 
     obs: dict[str, Tensor]  # each (T, N, ...): uint8 pixels stay uint8
     actions: Tensor  # (T, N, A)
@@ -337,8 +319,7 @@ def collect(
 ) -> tuple[Tensor, dict[str, list[float]]]:
     """Act for T steps in all environments; return the value (N,) of what follows, and metrics of the ended episodes.
 
-    The environments are those of `ppo_utils.environments`: an observation is a dict of images and vectors, and an ended
-    episode is reset in the same step, so that next_obs begins the next one. Metrics are lists by name:
+    An ended episode is reset in the same step, so that next_obs begins the next one. Metrics are lists by name:
     charts/episodic_return, charts/episodic_length, and episode/* for every number in the environment's final info.
     """
     device, memory = rollout.values.device, rollout.memory
@@ -412,9 +393,8 @@ def ppo_loss(
     autocast = torch.autocast(index.device.type, torch.bfloat16, enabled=args.amp)
     with autocast:
         x = encode(agent.encoder, rollout.obs, index, rollout.first_occurrence)  # (B, I)
-        policy, log_probs, values, features = agent.evaluate_actions(
-            x, gather(rollout.actions), minibatch, rollout.memory
-        )
+        actions = gather(rollout.actions)  # (B, A)
+        policy, log_probs, values, features = agent.evaluate_actions(x, actions, minibatch, rollout.memory)
     log_ratio = log_probs - gather(rollout.log_probs)  # (B, A)
     advantages, old_values, returns = gather(rollout.advantages), gather(rollout.values), gather(rollout.returns)
     if args.norm_adv == "minibatch":
@@ -457,16 +437,14 @@ def refresh_memory(agent: Agent, rollout: Rollout, args: Args) -> None:
 def clip_gradients(agent: Agent, args: Args) -> Tensor:
     """Scale the gradient down to --max-grad-norm if its norm is larger; return the norm.
 
-    A detached head is a probe of what the features hold. It is clipped by itself: a share in the agent's norm would
-    change the agent's step.
+    A detached head is clipped by itself: a share in the agent's norm would change the agent's step.
     """
-    auxiliary = ((agent.decoder, args.reconstruction_detach), (agent.estimator, args.ground_truth_detach))
-    probes = [[*network.parameters()] for network, detached in auxiliary if network is not None and detached]
-    for probe in probes:
-        nn.utils.clip_grad_norm_(probe, args.max_grad_norm)
-    of_probes = {parameter for probe in probes for parameter in probe}
-    others = [parameter for parameter in agent.parameters() if parameter not in of_probes]
-    return nn.utils.clip_grad_norm_(others, args.max_grad_norm)
+    own = {*agent.parameters()}
+    for head, detached in ((agent.decoder, args.reconstruction_detach), (agent.estimator, args.ground_truth_detach)):
+        if head is not None and detached:
+            nn.utils.clip_grad_norm_(head.parameters(), args.max_grad_norm)
+            own -= {*head.parameters()}
+    return nn.utils.clip_grad_norm_([each for each in agent.parameters() if each in own], args.max_grad_norm)
 
 
 def mean_logs(steps: list[dict[str, Tensor]], rollout: Rollout) -> dict[str, float]:
@@ -490,25 +468,16 @@ def anneal(step: int, initial: float, final: float, anneal_steps: int) -> float:
     return initial + fraction * (final - initial)
 
 
-def gae(
-    rewards: Tensor,
-    values: Tensor,
-    last_value: Tensor,
-    terminated: Tensor,
-    truncated: Tensor,
-    truncation_values: Tensor,
-    gamma: float,
-    gae_lambda: float,
-) -> Tensor:
+def gae(rollout: Rollout, last_value: Tensor, gamma: float, gae_lambda: float) -> Tensor:
     """Return the advantages (T, N) of generalized advantage estimation (2.34), cut wherever an episode ends.
 
-    last_value (N,) is the value of the observation after the last step. truncation_values (T, N) holds the value of
-    the final observation where a truncated episode is bootstrapped and zero elsewhere; a terminated one never is.
+    last_value (N,) is the value of the observation after the last step. Where an episode is truncated, what follows is
+    worth its truncation value, which is zero unless the final observation is bootstrapped; where it terminated, zero.
     """
-    done = terminated | truncated
-    next_values = torch.cat([values[1:], last_value[None]])  # (T, N)
-    next_values = torch.where(done, truncation_values * ~terminated, next_values)
-    deltas = rewards + gamma * next_values - values
+    done = rollout.terminated | rollout.truncated
+    next_values = torch.cat([rollout.values[1:], last_value[None]])  # (T, N)
+    next_values = torch.where(done, rollout.truncation_values * ~rollout.terminated, next_values)
+    deltas = rollout.rewards + gamma * next_values - rollout.values
     decay = gamma * gae_lambda * ~done
     advantages = torch.empty_like(deltas)
     advantage = torch.zeros_like(last_value)
@@ -545,9 +514,8 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: f
 def log_barrier(policy: list[Categorical]) -> Tensor:
     """Return the mean log-probability of all actions, not only of those taken: over samples, summed over branches.
 
-    It is largest for a uniform policy. Where an action's probability is near 0, the gradients of the surrogate loss and
-    of the entropy are near 0 too; that of the log barrier is not (Agarwal et al., On the Theory of Policy Gradient
-    Methods, 2021).
+    It is largest for a uniform policy. Near probability 0 the gradients of surrogate loss and entropy vanish, but that
+    of the log barrier does not (Agarwal et al., On the Theory of Policy Gradient Methods, 2021).
     """
     return sum(branch.logits.mean() for branch in policy)  # a Categorical's logits are normalized
 
@@ -632,12 +600,14 @@ class Pieces:
         return y.flatten(0, 1).index_select(0, steps.to(y.device))
 
     def minibatches(self, count: int) -> Iterator[Pieces]:
-        """Shuffle the pieces, and distribute them, whole, over count minibatches of about the same number of steps."""
+        """Shuffle the pieces, and distribute them, whole, over count minibatches of about the same number of steps.
+
+        No minibatch is empty: `check_minibatches` makes sure that no piece is longer than a minibatch's share.
+        """
         order = torch.randperm(len(self.first))
         first, length = self.first[order], self.length[order]
-        # (S,) the minibatch of each piece, by the position of its first step. No minibatch is empty: `check_args` makes
-        # sure that no piece is longer than a minibatch's share of the steps.
-        minibatch = (length.cumsum(0) - length) * count // length.sum()
+        twice_middle = 2 * length.cumsum(0) - length
+        minibatch = twice_middle * count // (2 * length.sum())  # (S,) of each piece, by the position of its middle
         sizes = minibatch.bincount(minlength=count).tolist()
         for mb_first, mb_length in zip(first.split(sizes), length.split(sizes), strict=True):
             yield Pieces(mb_first, mb_length, self.num_envs)
@@ -652,6 +622,205 @@ class Pieces:
 #   width                    D, the width of what comes out
 #   input_width, longest_piece, flags    what is known before it is made
 # begin_rollout, store and reset change a state in place; all others only read it.
+@dataclass
+class MemoryState:
+    """What N environments remember: a timeline of the W steps before a rollout and its T steps.
+
+    Row W + t of the timeline is step t of the rollout. Numbers of steps stay on the CPU: shapes depend on them, and
+    reading them from a GPU would force a synchronization.
+    """
+
+    now: int  # row of the step that comes next
+    episode_step: Tensor  # (N,) which step of its episode that is
+    hidden: Tensor  # (W + T, N, K + 1, D) the input of every block, and the last one's output
+    stored_step: Tensor  # (W + T, N) which step of its episode each row is
+    keys: Tensor  # (K, N, W + T, D) projections of the blocks' inputs, a cache for acting
+    values: Tensor  # (K, N, W + T, D)
+
+
+class Memory(nn.Module):
+    """Transformer-XL as an episodic memory with a sliding window (§5.3), or GTrXL.
+
+    Every step stores the inputs of the K blocks. A step's query in block k attends to the k-th input of up to W steps
+    before it, of the same episode, never to its own. Raises ValueError unless `inputs` is --trxl-dim, even and a
+    multiple of --trxl-num-heads, and for flags that would change nothing.
+    """
+
+    # With other values of these flags, the same weights are another network.
+    flags = ("trxl_num_layers", "trxl_num_heads", "trxl_dim", "trxl_memory_length", "trxl_positional_encoding")
+    flags += ("trxl_query_position", "trxl_query_output", "trxl_pe_length", "trxl_layer_norm", "trxl_gate")
+
+    def __init__(self, args: Args, inputs: int):
+        super().__init__()
+        if args.trxl_dim % args.trxl_num_heads or args.trxl_dim % 2:
+            raise ValueError(f"--trxl-dim is {args.trxl_dim}; it must be even and a multiple of --trxl-num-heads")
+        if inputs != args.trxl_dim:
+            raise ValueError(f"--trxl-dim is {args.trxl_dim}; with --no-embedding it must be {inputs} here")
+        if args.trxl_gate_bias and args.trxl_gate == "none":
+            raise ValueError("--trxl-gate-bias needs --trxl-gate gru; without, it changes nothing")
+        if args.trxl_pe_length != Args.trxl_pe_length and args.trxl_positional_encoding != "learned":
+            raise ValueError("--trxl-pe-length needs --trxl-positional-encoding learned; without, it changes nothing")
+        self.width, self.window = args.trxl_dim, args.trxl_memory_length
+        self.segment_length, self.memory_gradient = args.trxl_segment_length, args.trxl_memory_gradient
+        self.encoding, self.query_position = args.trxl_positional_encoding, args.trxl_query_position
+        self.cache_dtype = torch.bfloat16 if args.amp else torch.float32  # as the layers deliver keys and values
+        self.blocks = nn.ModuleList(Block(args) for _ in range(args.trxl_num_layers))
+        for block in self.blocks:
+            block_init(block, args.trxl_init, args.trxl_num_layers)
+        if self.encoding == "learned":
+            length = args.trxl_pe_length + 1  # one for what follows an episode's last step, which may be valued
+            self.table = nn.Parameter(torch.randn(length, self.width) / math.sqrt(self.width))
+        self.query_output = nn.Linear(self.width, self.width, bias=False) if args.trxl_query_output else None
+
+    @staticmethod
+    def input_width(args: Args) -> int:
+        """Return the width that the encoded observation is embedded in."""
+        return args.trxl_dim
+
+    @staticmethod
+    def longest_piece(args: Args) -> int:
+        """Return how many steps a piece of a rollout may have."""
+        return min(args.trxl_segment_length, args.num_steps)
+
+    def initial_state(self, num_envs: int, num_steps: int, device: torch.device) -> MemoryState:
+        """Return the state of fresh episodes, with no step to attend to and room for a rollout of num_steps."""
+        rows, blocks = self.window + num_steps, len(self.blocks)
+        cache = (blocks, num_envs, rows, self.width)
+        return MemoryState(
+            now=self.window,
+            episode_step=torch.zeros(num_envs, dtype=torch.int64),
+            hidden=torch.zeros(rows, num_envs, blocks + 1, self.width, device=device),
+            stored_step=torch.zeros(rows, num_envs, dtype=torch.int64),
+            keys=torch.zeros(cache, dtype=self.cache_dtype, device=device),
+            values=torch.zeros(cache, dtype=self.cache_dtype, device=device),
+        )
+
+    def carry(self, state: MemoryState) -> dict[str, Tensor]:
+        """Return what the next rollout begins with: the window before its first step."""
+        rows = slice(state.now - self.window, state.now)
+        stored = {"hidden": state.hidden[rows].clone(), "stored_step": state.stored_step[rows].clone()}
+        return stored | {"episode_step": state.episode_step}
+
+    def begin_rollout(self, state: MemoryState, carry: dict[str, Tensor]) -> None:
+        """Go on with what `carry` returned, and project it to keys and values with the current weights."""
+        state.now, state.episode_step = self.window, carry["episode_step"]
+        state.hidden[: self.window], state.stored_step[: self.window] = carry["hidden"], carry["stored_step"]
+        rows, _, mask = self.attended_rows(state)
+        mask = mask[:, 0].T  # (M, N)
+        # What no query attends to becomes zero: a NaN in it would spread even through a weight of zero.
+        hidden = state.hidden[rows].masked_fill(~mask[..., None, None], 0.0)  # (M, N, K + 1, D)
+        position = self.position(state.stored_step[rows].to(mask.device).where(mask, 0), hidden.dtype)  # (M, N, D)
+        for k, block in enumerate(self.blocks):
+            keys, values = block.keys_values(hidden[:, :, k] + position)
+            state.keys[k][:, rows], state.values[k][:, rows] = keys.transpose(0, 1), values.transpose(0, 1)
+
+    def step(self, state: MemoryState, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Take one step of all environments, x (N, D): return the output (N, D) and hidden states (N, K + 1, D)."""
+        rows, age, mask = self.attended_rows(state)
+        x = x[:, None]  # (N, 1, D)
+        episode_step = state.episode_step.to(x.device)[:, None]  # (N, 1)
+        hidden = [x]
+        for k, block in enumerate(self.blocks):
+            query = self.first_query(x, episode_step, state.hidden[state.now - 1, :, -1:]) if k == 0 else x
+            x = block(x, query, (state.keys[k][:, rows], state.values[k][:, rows]), age, mask)
+            hidden.append(x)
+        return x[:, 0], torch.cat(hidden, 1)  # (N, K + 1, D)
+
+    def store(self, state: MemoryState, hidden: Tensor) -> None:
+        """Store the step's hidden states (N, K + 1, D), and cache their projections to keys and values."""
+        state.hidden[state.now], state.stored_step[state.now] = hidden.detach(), state.episode_step
+        position = self.position(state.episode_step.to(hidden.device), hidden.dtype)  # (N, D)
+        for k, block in enumerate(self.blocks):
+            keys, values = block.keys_values(hidden[:, k] + position)  # (N, D) each
+            state.keys[k][:, state.now], state.values[k][:, state.now] = keys, values
+        state.now, state.episode_step = state.now + 1, state.episode_step + 1
+
+    def reset(self, state: MemoryState, done: Tensor) -> None:
+        """Forget the episodes that ended: done (N,), on the CPU."""
+        rows = slice(state.now - self.window_length(state.episode_step), state.now)
+        for cache in (state.keys, state.values):
+            # No query attends to these, but a NaN among them would spread even through a weight of zero.
+            cache[:, done.nonzero().to(cache.device), rows] = 0.0
+        state.episode_step = state.episode_step.masked_fill(done, 0)
+
+    def cut(self, done: Tensor) -> Pieces:
+        """Cut a rollout into segments. Where episodes end, done (T, N), is for `attention_mask` to see."""
+        starts = torch.arange(len(done)) % self.segment_length == 0
+        return Pieces.from_starts(starts[:, None].expand_as(done))
+
+    def unroll(self, state: MemoryState, x: Tensor, pieces: Pieces) -> Tensor:
+        """Run whole segments: x (B, D) to (B, D), attending to the stored hidden states of up to W steps before each.
+
+        All queries of a segment share its keys, and a band mask tells which of them each one attends to. Below, a
+        segment of four steps, a window of three, and an episode that ends after the second step (1: attended to):
+
+                               the W steps before   the segment's own, but for its last
+            query, step 5            1  1  1           .  .  .
+            query, step 6            .  1  1           1  .  .
+            query, step 0            .  .  .           .  .  .      an episode's first step attends to nothing
+            query, step 1            .  .  .           .  .  1
+
+        With --trxl-memory-gradient, the segment's own are recomputed block inputs instead of the stored ones: the same
+        numbers as long as the weights are, but with a gradient to earlier steps (Dai et al., 2019).
+        """
+        device, last_row = x.device, len(state.stored_step) - 1  # a short last segment's padding lies beyond that row
+        x = pieces.pad(x)  # (S, L, D)
+        first = pieces.first[:, None]  # (S, 1)
+        row, env = self.window + first // pieces.num_envs, first % pieces.num_envs  # (S, 1) of a segment's first step
+        columns = pieces.columns()  # (L,)
+        episode_step = state.stored_step[(row + columns).clamp(max=last_row), env].where(pieces.is_step(), 0)  # (S, L)
+        before = self.window_length(episode_step[:, 0])  # steps before the segment: later queries attend to no earlier
+        key_columns = torch.arange(-before, len(columns) - 1)  # (M,)
+        rows = (row + key_columns).clamp(max=last_row)  # (S, M)
+        stored_step = state.stored_step[rows, env].to(device)  # (S, M)
+        hidden = state.hidden[rows.to(device), env.to(device)]  # (S, M, K + 1, D)
+        age = (columns[:, None] - key_columns).to(device)  # (L, M)
+        episode_step = episode_step.to(device)
+        mask = attention_mask(age, episode_step[..., None], self.window)  # (S, L, M)
+        attended = mask.any(1)  # (S, M); what no query attends to becomes zero, so that not even a NaN has an effect
+        hidden, stored_step = hidden.masked_fill(~attended[..., None, None], 0.0), stored_step.where(attended, 0)
+        position = self.position(stored_step, x.dtype)  # (S, M, D)
+        previous_output = hidden[:, before - 1 :, -1]  # (S, L, D): columns -1 .. L - 2
+        for k, block in enumerate(self.blocks):
+            attended_to = hidden[:, :, k]  # (S, M, D)
+            if self.memory_gradient:
+                own = x[:, :-1].masked_fill(~attended[:, before:, None], 0.0)
+                attended_to = torch.cat([attended_to[:, :before], own], 1)
+            query = self.first_query(x, episode_step, previous_output) if k == 0 else x
+            x = block(x, query, block.keys_values(attended_to + position), age, mask)
+        return pieces.unpad(x)
+
+    def attended_rows(self, state: MemoryState) -> tuple[slice, Tensor, Tensor]:
+        """Return the M rows that the next step may attend to, their ages (1, M), and the mask (N, 1, M)."""
+        length = self.window_length(state.episode_step)
+        age = torch.arange(length, 0, -1)[None]  # (1, M), the oldest step first
+        mask = attention_mask(age, state.episode_step[:, None], self.window)[:, None]
+        return slice(state.now - length, state.now), age.to(state.hidden.device), mask.to(state.hidden.device)
+
+    def window_length(self, episode_step: Tensor) -> int:
+        """Return how much of the window queries at these steps may use; at least 1, since attention needs a key."""
+        return min(max(int(episode_step.max()), 1), self.window)
+
+    def encode_step(self, episode_step: Tensor, dtype: torch.dtype) -> Tensor:
+        """Encode steps of episodes (...) by the learned table, or as sines and cosines: (..., D)."""
+        if self.encoding == "learned":  # steps beyond the table share its last entry
+            return self.table[episode_step.clamp(max=len(self.table) - 1)]
+        return sinusoid(episode_step, self.width).to(dtype)
+
+    def position(self, stored_step: Tensor, dtype: torch.dtype) -> Tensor:
+        """Return what is added to hidden states of these steps (...): their encoding (..., D), or zeros without one."""
+        if self.encoding in ("absolute", "learned"):
+            return self.encode_step(stored_step, dtype)
+        return torch.zeros(*stored_step.shape, self.width, dtype=dtype, device=stored_step.device)
+
+    def first_query(self, x: Tensor, episode_step: Tensor, previous_output: Tensor) -> Tensor:
+        """Return x (S, L, D), and added to it the encoding of episode_step (S, L) and the previous output (§7.1.3)."""
+        query = x + self.encode_step(episode_step, x.dtype) if self.query_position else x
+        if self.query_output is not None:
+            query = query + self.query_output(previous_output.masked_fill(episode_step[..., None] == 0, 0.0))
+        return query
+
+
 def attention_mask(age: Tensor, episode_step: Tensor, window: int) -> Tensor:
     """Return whether a query at this step of its episode attends to the step that lies `age` steps before it.
 
@@ -667,6 +836,37 @@ def sinusoid(position: Tensor, width: int) -> Tensor:
     return torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)  # (..., width / 2, 2) to (..., width)
 
 
+class Block(nn.Module):
+    """A transformer block (figure 5.5): attention to the memory, then a projection, each merged with its input.
+
+    Layer norms come before both (figure 2.11b) or after both (2.11a). Parisotto et al. have a ReLU after attention too.
+    """
+
+    def __init__(self, args: Args):
+        super().__init__()
+        width = args.trxl_dim
+        before, after = (nn.LayerNorm, nn.Identity) if args.trxl_layer_norm == "pre" else (nn.Identity, nn.LayerNorm)
+        self.norm_query, self.norm_items, self.norm_output = before(width), before(width), before(width)
+        self.after_attention, self.after_projection = after(width), after(width)
+        self.attention = Attention(width, args.trxl_num_heads, args.trxl_positional_encoding == "relative")
+        self.projection = nn.Linear(width, width)
+        self.merge_attention = self.merge_output = torch.add  # residual connections
+        if args.trxl_gate == "gru":
+            self.merge_attention, self.merge_output = (Gate(width, args.trxl_gate_bias) for _ in range(2))
+
+    def keys_values(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Project hidden states (..., D), to which their positions are added already, to keys and values."""
+        hidden = self.norm_items(hidden)
+        return self.attention.key(hidden), self.attention.value(hidden)
+
+    def forward(self, x: Tensor, query: Tensor, keys_values: tuple, age: Tensor, mask: Tensor) -> Tensor:
+        """Map x (S, L, D) to the next block's input (S, L, D); query (S, L, D) is x, or x and what is added to it."""
+        x = self.merge_attention(x, self.attention(self.norm_query(query), *keys_values, age, mask))
+        x = self.after_attention(x)
+        x = self.merge_output(x, F.relu(self.projection(self.norm_output(x))))
+        return self.after_projection(x)
+
+
 class Attention(nn.Module):
     """Multi-head attention (2.55, 2.56) to hidden states that are projected to keys and values elsewhere.
 
@@ -676,7 +876,7 @@ class Attention(nn.Module):
 
     def __init__(self, width: int, num_heads: int, relative: bool):
         super().__init__()
-        self.num_heads = num_heads
+        self.num_heads, self.relative = num_heads, relative
         self.query = nn.Linear(width, width, bias=False)
         self.key = nn.Linear(width, width, bias=False)
         self.value = nn.Linear(width, width, bias=False)
@@ -684,7 +884,6 @@ class Attention(nn.Module):
         if relative:
             self.content_bias = nn.Parameter(torch.zeros(width))  # u
             self.position_bias = nn.Parameter(torch.zeros(width))  # v
-        self.relative = relative
 
     def forward(self, x: Tensor, keys: Tensor, values: Tensor, age: Tensor, mask: Tensor) -> Tensor:
         """Attend from x (S, L, D) to keys and values (S, M, D): exactly zero for a query with nothing to attend to.
@@ -737,39 +936,6 @@ class Gate(nn.Module):
         return torch.lerp(x, h.to(x.dtype), z.to(x.dtype))  # (1 - z) x + z h
 
 
-class Block(nn.Module):
-    """A transformer block (figure 5.5): attention to the memory, then a projection, each merged with its input.
-
-    Layer norms come before both (figure 2.11b), or after both (figure 2.11a). Parisotto et al. (2020) have a ReLU
-    behind the attention too.
-    """
-
-    def __init__(self, args: Args):
-        super().__init__()
-        width = args.trxl_dim
-        before, after = (nn.LayerNorm, nn.Identity) if args.trxl_layer_norm == "pre" else (nn.Identity, nn.LayerNorm)
-        self.norm_query, self.norm_items, self.norm_output = before(width), before(width), before(width)
-        self.after_attention, self.after_projection = after(width), after(width)
-        self.attention = Attention(width, args.trxl_num_heads, args.trxl_positional_encoding == "relative")
-        self.projection = nn.Linear(width, width)
-        if args.trxl_gate == "gru":
-            self.merge_attention, self.merge_output = (Gate(width, args.trxl_gate_bias) for _ in range(2))
-        else:
-            self.merge_attention = self.merge_output = torch.add  # residual connections
-
-    def keys_values(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Project hidden states (..., D), to which their positions are added already, to keys and values."""
-        hidden = self.norm_items(hidden)
-        return self.attention.key(hidden), self.attention.value(hidden)
-
-    def forward(self, x: Tensor, query: Tensor, keys_values: tuple, age: Tensor, mask: Tensor) -> Tensor:
-        """Map x (S, L, D) to the next block's input (S, L, D); query (S, L, D) is x, or x and what is added to it."""
-        x = self.merge_attention(x, self.attention(self.norm_query(query), *keys_values, age, mask))
-        x = self.after_attention(x)
-        x = self.merge_output(x, F.relu(self.projection(self.norm_output(x))))
-        return self.after_projection(x)
-
-
 def block_init(block: Block, scheme: str, blocks: int) -> None:
     """Initialize the weights of a block's layers by the scheme (table 6.1), and their biases with zero.
 
@@ -786,227 +952,6 @@ def block_init(block: Block, scheme: str, blocks: int) -> None:
         with torch.no_grad():
             for layer in (block.attention.value, block.attention.output, block.projection):
                 layer.weight.mul_(0.67 * blocks**-0.25)
-
-
-@dataclass
-class MemoryState:
-    """What N environments remember: a timeline of the W steps before a rollout and its T steps.
-
-    Row W + t of the timeline is step t of the rollout. Numbers of steps stay on the CPU: shapes depend on them, and
-    reading them from a GPU would force a synchronization.
-    """
-
-    now: int  # row of the step that comes next
-    episode_step: Tensor  # (N,) which step of its episode that is
-    hidden: Tensor  # (W + T, N, K + 1, D) the input of every block, and the last one's output
-    stored_step: Tensor  # (W + T, N) which step of its episode each row is
-    keys: Tensor  # (K, N, W + T, D) projections of the blocks' inputs, a cache for acting
-    values: Tensor  # (K, N, W + T, D)
-
-
-class Memory(nn.Module):
-    """Transformer-XL as an episodic memory with a sliding window (§5.3), or GTrXL.
-
-    Every step stores the inputs of the K blocks. A step's query in block k attends to the k-th input of up to W steps
-    before it, of the same episode, never to its own. Raises ValueError unless `inputs` is --trxl-dim, even and a
-    multiple of --trxl-num-heads, and for flags that would change nothing.
-    """
-
-    # That a model's weights depend on.
-    flags = ("trxl_num_layers", "trxl_num_heads", "trxl_dim", "trxl_positional_encoding", "trxl_query_output")
-    flags += ("trxl_pe_length", "trxl_layer_norm", "trxl_gate")
-
-    def __init__(self, args: Args, inputs: int):
-        super().__init__()
-        if args.trxl_dim % args.trxl_num_heads or args.trxl_dim % 2:
-            raise ValueError(f"--trxl-dim is {args.trxl_dim}; it must be even and a multiple of --trxl-num-heads")
-        if inputs != args.trxl_dim:
-            raise ValueError(f"--trxl-dim is {args.trxl_dim}; with --no-embedding it must be {inputs} here")
-        if args.trxl_gate_bias and args.trxl_gate == "none":
-            raise ValueError("--trxl-gate-bias needs --trxl-gate gru; without, it changes nothing")
-        if args.trxl_pe_length != Args.trxl_pe_length and args.trxl_positional_encoding != "learned":
-            raise ValueError("--trxl-pe-length needs --trxl-positional-encoding learned; without, it changes nothing")
-        self.width = args.trxl_dim
-        self.window = args.trxl_memory_length
-        self.segment_length = args.trxl_segment_length
-        self.encoding = args.trxl_positional_encoding
-        self.query_position = args.trxl_query_position
-        self.memory_gradient = args.trxl_memory_gradient
-        self.cache_dtype = torch.bfloat16 if args.amp else torch.float32  # as the layers deliver keys and values
-        self.blocks = nn.ModuleList(Block(args) for _ in range(args.trxl_num_layers))
-        for block in self.blocks:
-            block_init(block, args.trxl_init, args.trxl_num_layers)
-        if self.encoding == "learned":
-            length = args.trxl_pe_length + 1  # one for what follows an episode's last step, which may be valued
-            self.table = nn.Parameter(torch.randn(length, self.width) / math.sqrt(self.width))
-        self.query_output = nn.Linear(self.width, self.width, bias=False) if args.trxl_query_output else None
-
-    @staticmethod
-    def input_width(args: Args) -> int:
-        """Return the width that the encoded observation is embedded in."""
-        return args.trxl_dim
-
-    @staticmethod
-    def longest_piece(args: Args) -> int:
-        """Return how many steps a piece of a rollout may have."""
-        return min(args.trxl_segment_length, args.num_steps)
-
-    def initial_state(self, num_envs: int, num_steps: int, device: torch.device) -> MemoryState:
-        """Return the state of fresh episodes, with no step to attend to and room for a rollout of num_steps."""
-        rows, blocks = self.window + num_steps, len(self.blocks)
-        cache = (blocks, num_envs, rows, self.width)
-        return MemoryState(
-            now=self.window,
-            episode_step=torch.zeros(num_envs, dtype=torch.int64),
-            hidden=torch.zeros(rows, num_envs, blocks + 1, self.width, device=device),
-            stored_step=torch.zeros(rows, num_envs, dtype=torch.int64),
-            keys=torch.zeros(cache, dtype=self.cache_dtype, device=device),
-            values=torch.zeros(cache, dtype=self.cache_dtype, device=device),
-        )
-
-    def carry(self, state: MemoryState) -> dict[str, Tensor]:
-        """Return what the next rollout begins with: the window before its first step."""
-        rows = slice(state.now - self.window, state.now)
-        return {
-            "hidden": state.hidden[rows].clone(),
-            "stored_step": state.stored_step[rows].clone(),
-            "episode_step": state.episode_step,
-        }
-
-    def begin_rollout(self, state: MemoryState, carry: dict[str, Tensor]) -> None:
-        """Go on with what `carry` returned, and project it to keys and values with the current weights."""
-        state.now, state.episode_step = self.window, carry["episode_step"]
-        state.hidden[: self.window], state.stored_step[: self.window] = carry["hidden"], carry["stored_step"]
-        rows, _, mask = self.attended_rows(state)
-        mask = mask[:, 0].T  # (M, N)
-        # What no query attends to becomes zero: a NaN in it would spread even through a weight of zero.
-        hidden = state.hidden[rows].masked_fill(~mask[..., None, None], 0.0)  # (M, N, K + 1, D)
-        position = self.position(state.stored_step[rows].to(mask.device).where(mask, 0), hidden.dtype)  # (M, N, D)
-        for k, block in enumerate(self.blocks):
-            keys, values = block.keys_values(hidden[:, :, k] + position)
-            state.keys[k][:, rows], state.values[k][:, rows] = keys.transpose(0, 1), values.transpose(0, 1)
-
-    def step(self, state: MemoryState, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Take one step of all environments, x (N, D): return the output (N, D) and hidden states (N, K + 1, D)."""
-        rows, age, mask = self.attended_rows(state)
-        x = x[:, None]  # (N, 1, D)
-        episode_step = state.episode_step.to(x.device)[:, None]  # (N, 1)
-        hidden = [x]
-        for k, block in enumerate(self.blocks):
-            query = self.first_query(x, episode_step, state.hidden[state.now - 1, :, -1:]) if k == 0 else x
-            keys_values = state.keys[k][:, rows], state.values[k][:, rows]  # (N, M, D) each
-            x = block(x, query, keys_values, age, mask)
-            hidden.append(x)
-        return x[:, 0], torch.cat(hidden, 1)  # (N, K + 1, D)
-
-    def store(self, state: MemoryState, hidden: Tensor) -> None:
-        """Store the step's hidden states (N, K + 1, D), and cache their projections to keys and values."""
-        state.hidden[state.now], state.stored_step[state.now] = hidden.detach(), state.episode_step
-        position = self.position(state.episode_step.to(hidden.device), hidden.dtype)  # (N, D)
-        for k, block in enumerate(self.blocks):
-            keys, values = block.keys_values(hidden[:, k] + position)  # (N, D) each
-            state.keys[k][:, state.now], state.values[k][:, state.now] = keys, values
-        state.now, state.episode_step = state.now + 1, state.episode_step + 1
-
-    def reset(self, state: MemoryState, done: Tensor) -> None:
-        """Forget the episodes that ended: done (N,), on the CPU."""
-        rows = slice(state.now - self.window_length(state.episode_step), state.now)
-        for cache in (state.keys, state.values):
-            # No query attends to these, but a NaN among them would spread even through a weight of zero.
-            cache[:, done.nonzero().to(cache.device), rows] = 0.0
-        state.episode_step = state.episode_step.masked_fill(done, 0)
-
-    def cut(self, done: Tensor) -> Pieces:
-        """Cut a rollout into segments of --trxl-segment-length steps, the last one perhaps shorter.
-
-        Where episodes end, done (T, N), does not matter: `attention_mask` keeps them apart.
-        """
-        starts = torch.arange(len(done)) % self.segment_length == 0
-        return Pieces.from_starts(starts[:, None].expand_as(done))
-
-    def unroll(self, state: MemoryState, x: Tensor, pieces: Pieces) -> Tensor:
-        """Run whole segments: x (B, D) to (B, D), attending to the stored hidden states of up to W steps before each.
-
-        All queries of a segment share its keys, and a band mask tells which of them each one attends to. Below, a
-        segment of four steps, a window of three, and an episode that ends after the second step (1: attended to):
-
-                               the W steps before   the segment's own, but for its last
-            query, step 5            1  1  1           .  .  .
-            query, step 6            .  1  1           1  .  .
-            query, step 0            .  .  .           .  .  .      an episode's first step attends to nothing
-            query, step 1            .  .  .           .  .  1
-
-        With --trxl-memory-gradient, the segment's own are recomputed block inputs instead of the stored ones: the same
-        numbers as long as the weights are, but with a gradient to earlier steps (Dai et al., 2019).
-        """
-        device = x.device
-        last_row = len(state.stored_step) - 1  # indices are clamped to it: a short last segment's padding lies beyond
-        x = pieces.pad(x)  # (S, L, D)
-        first = pieces.first[:, None]  # (S, 1)
-        row, env = self.window + first // pieces.num_envs, first % pieces.num_envs  # (S, 1) of a segment's first step
-        columns = pieces.columns()  # (L,)
-        episode_step = state.stored_step[(row + columns).clamp(max=last_row), env].where(pieces.is_step(), 0)  # (S, L)
-        before = self.window_length(episode_step[:, 0])  # steps before the segment: later queries attend to no earlier
-        key_columns = torch.arange(-before, len(columns) - 1)  # (M,)
-        rows = (row + key_columns).clamp(max=last_row)  # (S, M)
-        stored_step = state.stored_step[rows, env].to(device)  # (S, M)
-        hidden = state.hidden[rows.to(device), env.to(device)]  # (S, M, K + 1, D)
-
-        age = (columns[:, None] - key_columns).to(device)  # (L, M)
-        episode_step = episode_step.to(device)
-        mask = attention_mask(age, episode_step[..., None], self.window)  # (S, L, M)
-        attended = mask.any(1)  # (S, M); what no query attends to becomes zero, so that not even a NaN has an effect
-        hidden, stored_step = hidden.masked_fill(~attended[..., None, None], 0.0), stored_step.where(attended, 0)
-        position = self.position(stored_step, x.dtype)  # (S, M, D)
-        previous_output = hidden[:, before - 1 :, -1]  # (S, L, D): columns -1 .. L - 2
-        for k, block in enumerate(self.blocks):
-            attended_to = hidden[:, :, k]  # (S, M, D)
-            if self.memory_gradient:
-                own = x[:, :-1].masked_fill(~attended[:, before:, None], 0.0)
-                attended_to = torch.cat([attended_to[:, :before], own], 1)
-            keys_values = block.keys_values(attended_to + position)
-            query = self.first_query(x, episode_step, previous_output) if k == 0 else x
-            x = block(x, query, keys_values, age, mask)
-        return pieces.unpad(x)
-
-    def attended_rows(self, state: MemoryState) -> tuple[slice, Tensor, Tensor]:
-        """Return the M rows that the next step may attend to, their ages (1, M), and the mask (N, 1, M)."""
-        length = self.window_length(state.episode_step)
-        age = torch.arange(length, 0, -1)[None]  # (1, M), the oldest step first
-        mask = attention_mask(age, state.episode_step[:, None], self.window)[:, None]
-        return slice(state.now - length, state.now), age.to(state.hidden.device), mask.to(state.hidden.device)
-
-    def window_length(self, episode_step: Tensor) -> int:
-        """Return how much of the window queries at these steps may use; at least 1, since attention needs a key."""
-        return min(max(int(episode_step.max()), 1), self.window)
-
-    def encode_step(self, episode_step: Tensor, dtype: torch.dtype) -> Tensor:
-        """Encode steps of episodes, of any shape, to (..., D): by the learned table, or as sines and cosines.
-
-        Steps beyond the table share its last entry.
-        """
-        if self.encoding == "learned":
-            return self.table[episode_step.clamp(max=len(self.table) - 1)]
-        return sinusoid(episode_step, self.width).to(dtype)
-
-    def position(self, stored_step: Tensor, dtype: torch.dtype) -> Tensor:
-        """Return what is added to hidden states of these steps (...): their encoding (..., D), or zeros without one."""
-        if self.encoding in ("absolute", "learned"):
-            return self.encode_step(stored_step, dtype)
-        return torch.zeros(*stored_step.shape, self.width, dtype=dtype, device=stored_step.device)
-
-    def first_query(self, x: Tensor, episode_step: Tensor, previous_output: Tensor) -> Tensor:
-        """Return the first block's query, x (S, L, D) and what is added to it at these steps (S, L) (§7.1.3).
-
-        With --trxl-query-position the encoding of the step; with --trxl-query-output a projection of the last block's
-        output of the step before, previous_output (S, L, D).
-        """
-        query = x
-        if self.query_position:
-            query = query + self.encode_step(episode_step, x.dtype)
-        if self.query_output is not None:
-            query = query + self.query_output(previous_output.masked_fill(episode_step[..., None] == 0, 0.0))
-        return query
 
 
 # ---- 5 AGENT ----
@@ -1041,36 +986,20 @@ class AtariCNN(nn.Sequential):
         return features.permute(0, 2, 3, 1).flatten(1)  # in the order they have in memory: no copy
 
 
-def fourier_features(x: Tensor, frequencies: int) -> Tensor:
-    """Append sines and cosines of x (B, V) at pi, 2 pi, 4 pi ...: (B, V (1 + 2 frequencies)).
-
-    They magnify small differences, so that a network learns sooner to tell values apart (Tancik et al., 2020).
-    """
-    angles = x[..., None] * (math.pi * 2 ** torch.arange(frequencies, device=x.device))  # (B, V, frequencies)
-    return torch.cat([x, angles.sin().flatten(1), angles.cos().flatten(1)], -1)
-
-
 class Encoder(nn.Module):
-    """Encodes each part of an observation, concatenates the features and embeds them in `width` (§5.1), unless None.
+    """Encodes the images and vectors of an observation, and embeds them together in `width` (§5.1), unless None."""
 
-    Raises ValueError for frequencies without a vector to take them of.
-    """
-
-    def __init__(self, spaces: dict[str, gym.spaces.Box], width: int | None, frequencies: int):
+    def __init__(self, spaces: dict[str, gym.spaces.Box], width: int | None):
         super().__init__()
-        self.frequencies = frequencies
         self.images = [name for name, space in spaces.items() if len(space.shape) == 3]
         self.vectors = [name for name, space in spaces.items() if len(space.shape) == 1]
         self.cnns = nn.ModuleList(AtariCNN(spaces[name].shape[2]) for name in self.images)
         with torch.no_grad():
             blank = [torch.zeros(1, *spaces[name].shape) for name in self.images]
-            features = sum(cnn(x).shape[1] for cnn, x in zip(self.cnns, blank, strict=True))
+            features = sum(cnn(image).shape[1] for cnn, image in zip(self.cnns, blank, strict=True))
         if self.vectors:
-            entries = sum(spaces[name].shape[0] for name in self.vectors)
-            self.mlp = layer_init(nn.Linear(entries * (1 + 2 * frequencies), 128))
+            self.mlp = layer_init(nn.Linear(sum(spaces[name].shape[0] for name in self.vectors), 128))
             features += 128
-        elif frequencies:
-            raise ValueError("--vector-frequencies needs an observation with a vector; use 0")
         self.width = features if width is None else width
         self.embedding = None if width is None else layer_init(nn.Linear(features, width))
 
@@ -1078,8 +1007,7 @@ class Encoder(nn.Module):
         """Encode observations, each part (B, ...), to (B, self.width)."""
         features = [in_chunks(cnn, obs[name]) for cnn, name in zip(self.cnns, self.images, strict=True)]
         if self.vectors:
-            vector = torch.cat([obs[name] for name in self.vectors], -1)
-            features.append(F.relu(self.mlp(fourier_features(vector, self.frequencies))))
+            features.append(F.relu(self.mlp(torch.cat([obs[name] for name in self.vectors], -1))))
         x = torch.cat(features, -1)
         if self.embedding is not None:
             x = F.relu(self.embedding(x))
@@ -1115,27 +1043,18 @@ def head(size: int, outputs: int, gain: float) -> nn.Sequential:
 
 
 class Decoder(nn.Sequential):
-    """The transposed Atari CNN, which reconstructs the observed image (§5.1.2, table 6.2).
+    """The transposed Atari CNN: reconstructs an image of shape (height, width, channels) (§5.1.2, table 6.2)."""
 
-    Raises ValueError unless the observation has one image.
-    """
-
-    def __init__(self, features: int, spaces: dict[str, gym.spaces.Box]):
-        images = [space.shape for space in spaces.values() if len(space.shape) == 3]
-        if len(images) != 1:
-            raise ValueError(f"--reconstruction-coef needs an observation with one image, not {len(images)}; use 0")
-        height, width, channels = images[0]
-        sizes = [(height, width)]  # of the image and of each convolution's output
+    def __init__(self, features: int, shape: tuple[int, int, int]):
+        *size, channels = shape  # of the image, then of each convolution's output
+        output_padding = []  # pixels at the right and lower edge that a convolution does not reach
         for kernel, stride in ((8, 4), (4, 2), (3, 1)):
-            sizes.append(tuple((size - kernel) // stride + 1 for size in sizes[-1]))
-        # Pixels at the right and lower edge that the encoder's first two strides do not reach.
-        output_padding = [
-            [(size - kernel) % stride for size in sizes[i]] for i, (kernel, stride) in enumerate(((8, 4), (4, 2)))
-        ]
+            output_padding.append([(side - kernel) % stride for side in size])
+            size = [(side - kernel) // stride + 1 for side in size]
         super().__init__(
-            layer_init(nn.Linear(features, 64 * math.prod(sizes[3]))),
+            layer_init(nn.Linear(features, 64 * math.prod(size))),
             nn.ReLU(inplace=True),
-            nn.Unflatten(1, (64, *sizes[3])),
+            nn.Unflatten(1, (64, *size)),
             layer_init(nn.ConvTranspose2d(64, 64, 3, 1)),
             nn.ReLU(inplace=True),
             layer_init(nn.ConvTranspose2d(64, 32, 4, 2, output_padding=output_padding[1])),
@@ -1157,13 +1076,15 @@ class Agent(nn.Module):
 
     def __init__(self, space: gym.spaces.Dict, nvec: list[int], args: Args, ground_truth_size: int = 0):
         super().__init__()
-        width = Memory.input_width(args) if args.embedding else None
-        self.encoder = Encoder(space.spaces, width, args.vector_frequencies)
+        self.encoder = Encoder(space.spaces, Memory.input_width(args) if args.embedding else None)
         self.memory = Memory(args, self.encoder.width)
-        self.heads = Heads(self.memory.width, nvec, args.head_size, args.value_init_gain)
+        self.heads = Heads(self.memory.width, nvec, args.trunk_size, args.value_init_gain)
+        images = [space[name].shape for name in self.encoder.images]
+        if args.reconstruction_coef and len(images) != 1:
+            raise ValueError(f"--reconstruction-coef needs an observation with one image, not {len(images)}; use 0")
         with torch.random.fork_rng([]):  # with and without these, the random numbers that follow are the same
-            self.decoder = Decoder(args.head_size, space.spaces) if args.reconstruction_coef else None
-            self.estimator = head(args.head_size, ground_truth_size, 1.0) if args.ground_truth_coef else None
+            self.decoder = Decoder(args.trunk_size, images[0]) if args.reconstruction_coef else None
+            self.estimator = head(args.trunk_size, ground_truth_size, 1.0) if args.ground_truth_coef else None
 
     def get_action_and_value(self, obs: dict[str, Tensor], memory: MemoryState) -> tuple[Tensor, Tensor, Tensor]:
         """Take one step of all environments, which the memory's state stores.
@@ -1208,8 +1129,7 @@ def setup(args: Args) -> Run:
     with one line for the user.
     """
     script = Path(__file__).stem
-    device, checkpoint = prepare(args, script)
-    check_minibatches(args, Memory.longest_piece(args))
+    device, checkpoint = prepare(args, script, Memory.longest_piece(args))
     with report_out_of_memory(args, device):
         envs = training_envs(args, checkpoint)
         obs, infos = envs.reset()

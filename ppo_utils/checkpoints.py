@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from ppo_utils.runs import Run
 
 T = TypeVar("T")  # a script's Args
+RENAMED = {"head_size": "trunk_size"}  # flags, by the names that they have in older files
 CHECKPOINTS_KEPT = 2
 
 
@@ -143,7 +144,8 @@ def read_model(path: str | Path) -> dict[str, Any]:
 def saved_args(kind: type[T], saved: dict[str, Any]) -> T:
     """Return the arguments, of a script's Args, in what `read_model` read; a flag that is newer has its default."""
     known = {each.name for each in fields(kind)}
-    return kind(**{name: value for name, value in saved["args"].items() if name in known})
+    given = {RENAMED.get(name, name): value for name, value in saved["args"].items()}
+    return kind(**{name: value for name, value in given.items() if name in known})
 
 
 def import_script(saved: dict[str, Any], path: str | Path) -> ModuleType:
@@ -184,7 +186,9 @@ def load_weights(agent: nn.Module, saved: dict[str, Any], path: str | Path) -> N
         if not all(name.startswith(("decoder.", "estimator.")) for name in (*missing, *unexpected)):
             raise RuntimeError
     except (RuntimeError, TypeError):
-        raise ValueError(f"{path} holds the weights of another network") from None
+        names = ("env_id", "obs_type", "frame_stack", "step_encoding", "observe_last_action", "vector_frequencies")
+        theirs = {name: saved["args"][name] for name in (*names, "embedding", "trunk_size") if name in saved["args"]}
+        raise ValueError(f"{path} holds the weights of another network, trained with {as_flags(theirs)}") from None
     if not all(weight.isfinite().all() for weight in saved["weights"].values()):
         raise ValueError(f"{path} holds weights that are not finite: the training diverged")
 
@@ -223,17 +227,14 @@ def load_model(args: Any, agent: nn.Module, script: str) -> None:
     if saved["script"] != script:
         raise ValueError(f"{path} was trained by {saved['script']}.py, not by {script}.py")
     theirs = saved_args(type(args), saved)
-    observed = ("env_id", "obs_type", "frame_stack", "step_encoding", "observe_last_action", "vector_frequencies")
-    flags = (*observed, "embedding", "head_size", *agent.memory.flags)
-    try:
-        load_weights(agent, saved, path)
-    except ValueError as error:
-        if "another network" not in str(error):
-            raise
-        trained_with = as_flags({name: getattr(theirs, name) for name in flags})
-        raise ValueError(f"{error}, trained with {trained_with}") from None
+    differ = [name for name in agent.memory.flags if getattr(args, name) != getattr(theirs, name)]
+    if differ:
+        ours, theirs = (as_flags({name: getattr(each, name) for name in differ}) for each in (args, theirs))
+        raise ValueError(f"{path} was trained with {theirs}, not with {ours}")
+    load_weights(agent, saved, path)
 
 
+@torch.no_grad()
 def load_checkpoint(run: Run, saved: dict[str, Any]) -> None:
     """Set a run that was just made to what `save_checkpoint` wrote: it goes on as if it had never stopped.
 

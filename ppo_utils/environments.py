@@ -30,6 +30,7 @@ from memory_gym_envs.options import brief
 from memory_gym_envs.saving import Saved
 from ppo_utils.observations import ObservationParts
 from ppo_utils.wrappers import (
+    FourierFeatures,
     GrayscaleStack,
     LastAction,
     SpotlightPerturbation,
@@ -42,7 +43,7 @@ from ppo_utils.wrappers import (
 def envs_for(args: Any, num_envs: int, **kwargs: Any) -> VectorEnv:
     """Make the environments that a script's arguments describe; kwargs and errors are those of `make_envs`."""
     names = ("num_levels", "start_level", "obs_type")
-    names += ("frame_stack", "step_encoding", "observe_last_action", "spotlight_perturbation")
+    names += ("frame_stack", "step_encoding", "observe_last_action", "spotlight_perturbation", "vector_frequencies")
     kwargs |= {name: getattr(args, name) for name in names}
     return make_envs(args.env_id, num_envs, options=parse_options(args.env_id, args.env_options), **kwargs)
 
@@ -66,6 +67,7 @@ def make_envs(
     step_encoding: bool = False,
     observe_last_action: bool = False,
     spotlight_perturbation: bool = False,
+    vector_frequencies: int = 0,
     render_mode: str | None = None,
 ) -> VectorEnv:
     """Make a vector environment of N lanes with same-step autoreset; the caller's `reset()` begins.
@@ -78,8 +80,8 @@ def make_envs(
     options: reset parameters of a Memory Gym environment, the defaults of every reset; see `parse_options`.
     num_levels, start_level, obs_type: of Memory Gym environments; others have no such thing and ignore them, with a
         line on stderr where pictures are shown though vectors were asked for.
-    frame_stack, step_encoding, observe_last_action, spotlight_perturbation: see GrayscaleStack and VectorStack,
-        StepEncoding, LastAction, SpotlightPerturbation.
+    frame_stack, step_encoding, observe_last_action, spotlight_perturbation, vector_frequencies: see GrayscaleStack and
+        VectorStack, StepEncoding, LastAction, SpotlightPerturbation, FourierFeatures.
     render_mode: what render() draws; of other packages than this, always rgb_array.
 
     Observations are dicts of pictures and vectors, see `ObservationParts`; actions are integers (N, A), see
@@ -115,6 +117,9 @@ def make_envs(
         envs = StepEncoding(envs)
     if observe_last_action:
         envs = LastAction(envs)
+    if vector_frequencies:
+        with one_line_errors("--vector-frequencies"):
+            envs = FourierFeatures(envs, vector_frequencies)
 
     first_seed = None
     if seed is not None:

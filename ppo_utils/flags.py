@@ -1,5 +1,6 @@
 """Flags of the scripts: their types with bounds, their spelling, and the checks that need no environment."""
 
+import shlex
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import tyro
@@ -44,7 +45,7 @@ def flag(name: str) -> str:
 def as_flags(values: dict[str, Any]) -> str:
     """Return values of fields of Args as a command line."""
     return " ".join(
-        flag(name if value else f"no_{name}") if isinstance(value, bool) else f"{flag(name)} {value}"
+        flag(name if value else f"no_{name}") if isinstance(value, bool) else f"{flag(name)} {shlex.quote(str(value))}"
         for name, value in values.items()
     )
 

@@ -41,7 +41,7 @@ from ppo_utils.checkpoints import (
 )
 from ppo_utils.environments import envs_for
 from ppo_utils.evaluation import REPEATS, evaluate, evaluation_levels
-from ppo_utils.flags import as_flags, check_args, flag
+from ppo_utils.flags import as_flags, check_args, check_minibatches, flag
 from ppo_utils.processes import (
     RunError,
     all_gather,
@@ -77,6 +77,7 @@ class Run:
     received_signal: int = 0  # SIGTERM or SIGINT, if this process got one
     stop: bool = False  # a process got one: this iteration is the last
     episodes: dict[str, list[float]] = field(default_factory=dict)  # metrics of those that ended in the last iteration
+    scores: dict[str, torch.Tensor] = field(default_factory=dict)  # of the last evaluation, see `level_scores`
 
 
 # ---- setting up ----
@@ -92,21 +93,23 @@ def parse_args(kind: type[T], presets: dict[str, dict[str, Any]], argv: list[str
     default = kind(**presets.get(given.preset, {}))  # tyro reports an unknown one, as all errors
     if given.resume is not None:
         default = saved_args(kind, read_checkpoint(given.resume))
-    laptop = as_flags(presets["laptop"])
-    description = f"{kind.__doc__} The defaults are the thesis'. --preset laptop stands for {laptop}"
-    return tyro.cli(kind, args=argv, default=default, description=description)
+    held = {name: {k: v for k, v in values.items() if k != "preset"} for name, values in presets.items()}
+    lines = [f"--preset {name} stands for {as_flags(values)}" for name, values in held.items() if values]
+    return tyro.cli(kind, args=argv, default=default, description="\n\n".join([kind.__doc__, *lines]))
 
 
-def prepare(args: Any, script: str) -> tuple[torch.device, dict[str, Any] | None]:
+def prepare(args: Any, script: str, longest_piece: int) -> tuple[torch.device, dict[str, Any] | None]:
     """Check the arguments, join other processes and seed the generators; return the device and --resume's checkpoint.
 
-    Raises ValueError, OSError or ImportError, each with one line for the user.
+    longest_piece: the most steps that a piece of a rollout may have, of which minibatches are made. Raises ValueError,
+    OSError or ImportError, each with one line for the user.
     """
     join_processes()
     checkpoint = None if args.resume is None else read_checkpoint(args.resume)
     if checkpoint is not None:
         check_resumed(args, checkpoint, script)
     check_args(args)
+    check_minibatches(args, longest_piece)
     if args.capture_video:
         check_can_film(args.env_id)
     seed_generators(args.seed)
@@ -261,14 +264,16 @@ def report(args: Any, run: Run, logs: dict[str, float], episodes: dict[str, list
     """
     iterations = args.total_timesteps // (args.num_envs * args.num_steps)
     is_last = run.iteration == iterations
-    scores = {}
-    if run.eval_envs is not None and (run.iteration % args.eval_interval == 0 or is_last):
-        scores = level_scores(args, run)
-        logs |= {f"eval/{name}": values.mean().item() for name, values in scores.items()}
+    if evaluates := run.eval_envs is not None and (run.iteration % args.eval_interval == 0 or is_last):
+        run.scores = level_scores(args, run)
+        logs |= {f"eval/{name}": values.mean().item() for name, values in run.scores.items()}
     run.stop = any(all_gather(run.received_signal))
     logs, episodes = combine_logs(all_gather((logs, episodes)))
     with report_failed_write(run.folder):
-        write_logs(args, run, logs, episodes, scores)
+        write_logs(args, run, logs, episodes)
+        if evaluates:
+            for name, values in run.scores.items():
+                run.writer.add_tensor(f"eval_levels/{name}", values, run.step)
         if args.checkpoint_interval and (run.iteration % args.checkpoint_interval == 0 or is_last or run.stop):
             save_checkpoint(args, run)
 
@@ -289,13 +294,7 @@ def level_scores(args: Any, run: Run) -> dict[str, torch.Tensor]:
     return {name: values.unflatten(0, (-1, REPEATS)) for name, values in complete.items()}
 
 
-def write_logs(
-    args: Any,
-    run: Run,
-    logs: dict[str, float],
-    episodes: dict[str, list[float]],
-    scores: dict[str, torch.Tensor],
-) -> None:
+def write_logs(args: Any, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
     """Write an iteration's numbers to TensorBoard and the progress bar; the first process does."""
     run.seconds += logs["charts/seconds_iteration"]
     run.episodes = episodes
@@ -307,8 +306,6 @@ def write_logs(
     logs["charts/SPS"] = run.step / run.seconds
     for name, value in logs.items():
         run.writer.add_scalar(name, value, run.step)
-    for name, values in scores.items():
-        run.writer.add_tensor(f"eval_levels/{name}", values, run.step)
     last = {"return": run.returns, "length": run.lengths}
     shown = {name: f"{np.mean(values):.2f}" for name, values in last.items() if values}
     run.bar.set_postfix({**shown, "SPS": f"{logs['charts/SPS']:.0f}"}, refresh=False)
@@ -361,7 +358,23 @@ def run_to_end(args: Any, run: Run, train: Callable[[Any, Run], None]) -> Path:
                     write_file(model_of(args, run), run.folder / "model.pt")
         finally:
             close(run)
+    if run.writer is not None:
+        print(summary(args, run))
     return run.folder
+
+
+def summary(args: Any, run: Run) -> str:
+    """Return the lines that a training ends with: what it reached, and the commands that go on from there."""
+    score = "no episode ended"
+    if run.scores:
+        score = f"return {run.scores['return'].mean():.2f} on {args.eval_levels} unseen levels"
+    elif run.returns:
+        score = f"return {np.mean(run.returns):.2f}, mean of the last {len(run.returns)} episodes"
+    models = [run.folder / "model.pt"] if args.save_model else checkpoints_in(run.folder)[-1:]
+    lines = [f"{run.folder}: {run.step:,} steps, {score}"]
+    lines += [f"evaluate: python evaluate.py {path}" for path in models]
+    lines += [f"watch: python enjoy.py {path} --out page.html" for path in models]
+    return "\n".join([*lines, f"plot: tensorboard --logdir {run.folder}"])
 
 
 def close(run: Run) -> None:

@@ -1,4 +1,4 @@
-"""Vector wrappers of observations: frame stacks, the step number, the last action, the spotlight perturbation.
+"""Vector wrappers of observations: frame stacks, the step, the last action, Fourier features, a perturbation.
 
 They take any vector environment with same-step autoreset. Gymnasium's (1.4) own vector wrappers of observations refuse
 those, and it has no frame stack for vector environments at all.
@@ -6,6 +6,7 @@ Shape letters: N lanes, n some of them, H and W of a picture, K frames of a stac
 vector, A action branches.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -31,6 +32,7 @@ from memory_gym_envs.searing_spotlights import (
 
 OBSERVATION = "observation"  # the name of an observation that is no Dict, where it becomes a part of one
 STEP_ENCODING, LAST_ACTION = "step_encoding", "last_action"  # parts of a Dict that the wrappers add
+SINES, COSINES = "sines", "cosines"
 LUMA = np.array([77, 150, 29], np.float32) / 256  # ITU-R 601, in 256ths so that all sums are exact
 SPOT_STREAM = 2  # keeps the generators of the perturbation apart from those of the environment with the same seed
 HEAD_START = 0.3  # of its way, that a spotlight of the perturbation has gone when an episode begins
@@ -292,6 +294,43 @@ class LastAction(SameStepWrapper):
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
         """The lanes' observations with a copy of their last actions."""
         return {**named(observations), LAST_ACTION: np.array(self._last[lanes])}
+
+
+class FourierFeatures(SameStepWrapper):
+    """Sines and cosines of all vectors at pi, 2 pi, 4 pi ..., beside the vectors, whose entries are best from 0 to 1.
+
+    They magnify small differences, so that a network learns sooner to tell values apart (Tancik et al., 2020).
+
+    frequencies: K.
+    Observation: Dict of the environment's own parts, or `observation` if it is no Dict, then `sines` and `cosines`, Box
+    (V K,) float32 each, V entries of all vectors together.
+
+    Raises ValueError for an environment without same-step autoreset or vector, or with parts of these names.
+    """
+
+    def __init__(self, env: VectorEnv, frequencies: int):
+        super().__init__(env)
+        self.arguments = {"frequencies": frequencies}
+        self._angles = np.float32(math.pi) * 2.0 ** np.arange(frequencies, dtype=np.float32)  # (K,) of an entry of 1
+        parts = named(env.single_observation_space)
+        self._vectors = [name for name, part in parts.items() if len(part.shape) == 1]
+        if not self._vectors or {SINES, COSINES} & parts.keys():
+            raise ValueError(f"FourierFeatures needs a vector to observe, and to add features, not {parts}")
+        entries = sum(parts[name].shape[0] for name in self._vectors)
+        features = gym.spaces.Box(-1.0, 1.0, (entries * frequencies,), np.float32)
+        self._set_space(gym.spaces.Dict({**parts, SINES: features, COSINES: features}, sort_keys=False))
+
+    def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
+        """Nothing: features depend on the present observation alone."""
+
+    def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
+        """Nothing, too."""
+
+    def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
+        """The lanes' observations with the features of their vectors."""
+        vectors = np.concatenate([named(observations)[name] for name in self._vectors], axis=1, dtype=np.float32)
+        angles = (vectors[..., None] * self._angles).reshape(len(vectors), -1)  # (n, V K)
+        return {**named(observations), SINES: np.sin(angles), COSINES: np.cos(angles)}
 
 
 class SpotlightPerturbation(PictureWrapper):

@@ -33,13 +33,13 @@ def loss_of(script, args, run):
 
 @pytest.mark.parametrize("shape", [(84, 84, 3), (84, 84, 16), (64, 64, 1), (61, 90, 3), (36, 37, 2)])
 def test_the_decoder_reconstructs_pictures_of_the_observation_s_size(shape):
-    decoder = Decoder(32, {"picture": gym.spaces.Box(0, 255, shape, np.uint8)})
+    decoder = Decoder(32, shape)
     assert decoder(torch.randn(2, 32)).shape == (2, *shape)
     assert [layer.out_channels for layer in decoder if hasattr(layer, "out_channels")] == [64, 32, shape[2]]
 
 
 def test_the_decoder_is_the_transposed_encoder():
-    decoder = Decoder(512, {"picture": gym.spaces.Box(0, 255, (84, 84, 3), np.uint8)})
+    decoder = Decoder(512, (84, 84, 3))
     sizes, x = [], torch.randn(1, 512)
     for layer in decoder:
         x = layer(x)

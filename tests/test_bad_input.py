@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import types
+from dataclasses import asdict
 
 import gymnasium as gym
 import pytest
@@ -15,6 +16,8 @@ from conftest import SCRIPTS, parse_args
 import ppo_gru
 import ppo_trxl
 from ppo_utils import runs
+from ppo_utils.checkpoints import make_agent
+from ppo_utils.environments import envs_for
 from ppo_utils.flags import check_args, check_minibatches
 
 SCRIPT = os.path.abspath(ppo_gru.__file__)
@@ -30,7 +33,7 @@ CASES = {
     '--env-options {"arena_size":9}': "arena_size.*2.*6",
     '--env-id CartPole-v1 --env-options {"a":1}': "CartPole-v1 has none",
     "--num-envs 0": "--num-envs is 0; it must be 1 or more",
-    "--vector-frequencies 4": "--vector-frequencies needs an observation with a vector; use 0",
+    "--vector-frequencies 4": "--vector-frequencies: FourierFeatures needs a vector to observe",
     "--vector-frequencies 17": "--vector-frequencies is 17; it must be 0 to 16",
     "--gamma 1.5": "--gamma is 1.5; it must be 0 to 1",
     "--init-lr nan": "--init-lr is nan; it must be 0 to 1",
@@ -78,6 +81,12 @@ def setup_error(args, script=ppo_gru):
     return str(error.value)
 
 
+def opened_weights(script, args):
+    """The weights of a fresh agent."""
+    envs = envs_for(args, 1)
+    return make_agent(script.Agent, envs, envs.reset()[1], args).state_dict()
+
+
 @pytest.mark.parametrize("line", CASES)
 def test_setup_names_the_fault(line):
     message = setup_error(parse_args(ppo_gru, *line.split()))
@@ -102,6 +111,8 @@ def test_the_command_prints_one_line_and_fails(line, tmp_path):
 WRONG_FLAGS = {
     "--memory gur": "'gru'",
     "--preset desktop": "laptop",
+    "--preset": "preset",
+    "--resume": "resume",
     "--num-envs many": "num-envs",
     "--no-such-flag 1": "no-such-flag",
 }
@@ -170,11 +181,12 @@ def test_a_run_folder_that_cannot_be_written(tmp_path, tiny):
 def test_a_model_of_another_network(tiny):
     folder = ppo_gru.main(tiny(env_id="CueRecall-v0", save_model=True))
     path = os.path.join(folder, "model.pt")
-    with pytest.raises(
-        ValueError, match=r"another network, trained with --env-id CueRecall-v0 .* --memory gru --hidden-size 32"
-    ):
+    with pytest.raises(ValueError, match=r"model\.pt was trained with --hidden-size 32, not with --hidden-size 64"):
         ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path, hidden_size=64))
-    torch.save({"script": "ppo_gru", "args": {}, "weights": {"memory.rnn.bias_hh_l0": torch.zeros(3)}}, path)
+    with pytest.raises(ValueError, match=r"weights of another network, trained with --env-id CueRecall-v0 .*-size 512"):
+        ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path, trunk_size=64))
+    saved = {"script": "ppo_gru", "args": asdict(tiny()), "weights": {"memory.rnn.bias_hh_l0": torch.zeros(3)}}
+    torch.save(saved, path)
     with pytest.raises(ValueError, match="another network"):
         ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path))
     torch.save({"script": "ppo_trxl", "args": {}, "weights": {}}, path)
@@ -184,6 +196,26 @@ def test_a_model_of_another_network(tiny):
         torch.save(wrong, path)
         with pytest.raises(ValueError, match="is cut short, or neither a model nor a checkpoint"):
             ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path))
+
+
+NETWORKS = {
+    "trxl_num_heads": 4,
+    "trxl_memory_length": 9,
+    "trxl_positional_encoding": "none",
+    "trxl_query_position": True,
+    "trxl_layer_norm": "post",
+}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_model_whose_weights_fit_but_mean_something_else(tiny, name):
+    """With another number of heads, encoding or window, the same weights compute something else."""
+    other = tiny(ppo_trxl, env_id="CueRecall-v0", **{name: NETWORKS[name]})
+    weights = opened_weights(ppo_trxl, tiny(ppo_trxl, env_id="CueRecall-v0"))
+    torch.save({"script": "ppo_trxl", "args": asdict(other), "weights": weights}, "model.pt")
+    message = setup_error(tiny(ppo_trxl, env_id="CueRecall-v0", load_model="model.pt"), ppo_trxl)
+    named = name.replace("_", "-")
+    assert re.match(rf"model\.pt was trained with --{named}.*, not with --(no-)?{named}", message), message
 
 
 def test_a_model_file_that_is_none(tiny, tmp_path):
@@ -210,7 +242,7 @@ def test_a_training_that_diverges(tiny, opened, script):
     assert not glob.glob("runs/*/model.pt*"), "nothing is left of it"
     run = opened(script, tiny(script, env_id="CueRecall-v0", exp_name="spoilt"))
     next(run.agent.parameters()).data.fill_(float("nan"))
-    torch.save({"script": script.__name__, "args": {}, "weights": run.agent.state_dict()}, "spoilt.pt")
+    torch.save({"script": script.__name__, "args": vars(args), "weights": run.agent.state_dict()}, "spoilt.pt")
     message = setup_error(tiny(script, env_id="CueRecall-v0", load_model="spoilt.pt"), script)
     assert message == "spoilt.pt holds weights that are not finite: the training diverged"
 

@@ -41,7 +41,7 @@ def test_every_claim_compares_agents_that_can_be_trained(name):
 
 
 def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
-    small = "--num-envs 2 --num-steps 32 --num-minibatches 2 --head-size 8 --eval-levels 2"
+    small = "--num-envs 2 --num-steps 32 --num-minibatches 2 --trunk-size 8 --eval-levels 2"
     monkeypatch.setattr(learning, "COMMON", f"{learning.COMMON} {small}")
     names = ("normalized-mortar-mayhem", "normalized-gradients")
     config = claims.Config(claims=names, steps_scale=64 / 1e6, seeds=(1, 2), evaluations=1, folder=tmp_path / "runs")

@@ -59,16 +59,6 @@ def test_without_an_embedding_the_memory_takes_the_encoded_observation():
         ppo_trxl.Agent(PIXELS, [3, 3], ppo_trxl.Args(embedding=False))
 
 
-def test_fourier_features_of_a_vector():
-    x, root = torch.tensor([[0.25, 1.0]]), 0.5**0.5
-    wanted = torch.tensor([[0.25, 1.0, root, 1.0, 0.0, 0.0, root, 0.0, -1.0, 1.0]])
-    torch.testing.assert_close(ppo_gru.fourier_features(x, 2), wanted, atol=1e-6, rtol=0)
-    assert ppo_gru.fourier_features(x, 0).equal(x)
-    vector = gym.spaces.Box(0, 1, (16,), np.float32)
-    agent = Agent(gym.spaces.Dict(observation=vector), [4], Args(vector_frequencies=4))
-    assert agent.encoder.mlp.in_features == 144
-
-
 def test_defaults_are_the_final_column_of_table_6_1():
     args = Args()
     final = {
@@ -97,7 +87,7 @@ def test_chunks_do_not_change_the_features(monkeypatch):
 
 def test_batches_are_rounded_up_in_bfloat16_which_changes_nothing():
     torch.manual_seed(0)
-    agent = Agent(PIXELS, [4], Args(hidden_size=32, head_size=32))
+    agent = Agent(PIXELS, [4], Args(hidden_size=32, trunk_size=32))
     pixels = torch.randint(0, 256, (16, 1, 84, 84, 3), dtype=torch.uint8)
     obs, sizes, found = {"observation": pixels}, [], []
     agent.encoder.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0]["observation"])))
@@ -115,7 +105,7 @@ def test_batches_are_rounded_up_in_bfloat16_which_changes_nothing():
 
 def test_heads_compute_in_float32_with_amp():
     torch.manual_seed(0)
-    agent, x = Agent(PIXELS, [4], Args(hidden_size=32, head_size=32)), torch.randn(5, 32)
+    agent, x = Agent(PIXELS, [4], Args(hidden_size=32, trunk_size=32)), torch.randn(5, 32)
     wanted = agent.heads(x)
     with torch.autocast("cpu", torch.bfloat16):
         found = agent.heads(x)

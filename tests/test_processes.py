@@ -52,7 +52,7 @@ def torchrun(*command, processes=2):
 
 def flags_of(script, **changes):
     flags = {"env-id": GRID["env_id"], "obs-type": "vector", "num-envs": 4, "num-steps": 16, "num-minibatches": 2}
-    flags |= {"head-size": 16, "total-timesteps": 6 * 64, **changes}
+    flags |= {"trunk-size": 16, "total-timesteps": 6 * 64, **changes}
     return [*WIDTH[script].split(), "--no-cuda", *(part for k, v in flags.items() for part in (f"--{k}", str(v)))]
 
 

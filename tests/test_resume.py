@@ -242,8 +242,7 @@ def test_a_second_interrupt_ends_the_training_at_once(tiny, opened, monkeypatch)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_to_the_command(tiny, curves, tmp_path, number):
     """As a cluster sends it at a time limit: checkpoint and model are written, and the curve goes on."""
-    flags = "--env-id MortarMayhemB-Grid-v0 --obs-type vector --hidden-size 8 --head-size 8 --num-envs 2 --num-steps 32"
-    flags = [*flags.split(), "--num-minibatches", "2", "--no-cuda", "--total-timesteps", "6400"]
+    flags = [*FEW, "--num-steps", "32", "--total-timesteps", "6400"]
     command = [sys.executable, ppo_gru.__file__, *flags, "--save-model"]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
         deadline = threading.Timer(200, process.kill)
@@ -391,7 +390,7 @@ def limited(size, *flags):
     return done.stderr.strip().splitlines()[-1]
 
 
-FEW = "--hidden-size 8 --head-size 8 --num-envs 2 --num-steps 8 --num-minibatches 2 --no-cuda --obs-type vector"
+FEW = "--hidden-size 8 --trunk-size 8 --num-envs 2 --num-steps 8 --num-minibatches 2 --no-cuda --obs-type vector"
 FEW = ["--env-id", "MortarMayhemB-Grid-v0", *FEW.split()]
 
 

@@ -21,6 +21,7 @@ LANES = 3
 WRAPPERS = {
     "frame stack": {"frame_stack": 3},
     "step encoding": {"step_encoding": True},
+    "Fourier features": {"obs_type": "vector", "vector_frequencies": 2},
     "last action": {"observe_last_action": True},
     "perturbation": {"spotlight_perturbation": True},
 }

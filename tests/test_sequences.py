@@ -64,6 +64,33 @@ def test_minibatches_deal_every_step_once(seq_len):
     assert order != [minibatch.first.tolist() for minibatch in minibatches], "the pieces are shuffled again"
 
 
+@pytest.mark.parametrize(("num_envs", "num_steps", "ends"), [(32, 512, 0.01), (8, 128, 0.0), (8, 128, 0.02)])
+def test_minibatches_have_the_same_number_of_steps_on_average(num_envs, num_steps, ends):
+    """None of them is larger because of its place in the epoch."""
+    torch.manual_seed(0)
+    memory, sizes = Memory(Args(hidden_size=4), 4), []
+    for _ in range(400):
+        pieces = memory.cut(torch.rand(num_steps, num_envs) < ends)
+        sizes.append([int(minibatch.length.sum()) for minibatch in pieces.minibatches(8)])
+    sizes = torch.tensor(sizes, dtype=torch.float64)
+    deviation = (sizes.mean(0) - num_envs * num_steps / 8).abs()
+    assert (deviation <= 4 * sizes.std(0) / 400**0.5).all(), sizes.mean(0)
+
+
+def test_one_long_piece_beside_many_short_ones():
+    """Minibatches have as many steps, not as many pieces: the one with the long piece has few others."""
+    torch.manual_seed(0)
+    length = torch.tensor([64, *[1] * 192])
+    pieces = Pieces(length.cumsum(0) - length, length, num_envs=1)
+    for _ in range(20):
+        for minibatch in pieces.minibatches(4):
+            assert abs(int(minibatch.length.sum()) - 64) <= 64
+            if minibatch.length.max() == 64:
+                assert len(minibatch.length) <= 65, "the steps of another minibatch, and half of it on each side"
+        sizes = [len(minibatch.length) for minibatch in pieces.minibatches(4)]
+        assert max(sizes) - min(sizes) >= 32, "as many pieces each would be 48"
+
+
 def test_no_minibatch_is_empty_at_the_limit_of_check_minibatches():
     memory = Memory(Args(hidden_size=4), 4)
     for seed, rate in itertools.product(range(30), (0.0, 0.1, 0.5)):

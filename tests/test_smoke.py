@@ -1,5 +1,6 @@
 """A short training of each kind, through `main` and through the command line."""
 
+import dataclasses
 import glob
 import math
 import os
@@ -118,19 +119,23 @@ def test_trains(tiny, scalars, env_id, memory):
         assert curves.keys() >= EPISODES
 
 
-def test_trains_on_vectors_and_their_frequencies(tiny, scalars, monkeypatch):
+def test_trains_on_vectors_and_their_frequencies(tiny, scalars):
     """The network takes the Fourier features, and a model that is older than the flag is one without them."""
     vectors = {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "vector_frequencies": 4, "save_model": True}
-    taken, append = [], ppo_gru.fourier_features
-    monkeypatch.setattr(ppo_gru, "fourier_features", lambda *given: taken.append(append(*given)) or taken[-1])
     folder = ppo_gru.main(tiny(**vectors))
-    assert {part.shape[1] for part in taken} == {16 * 9}
     assert all(error < 1e-5 for error in scalars(folder)["losses/ratio_error"])
     path = os.path.join(folder, "model.pt")
     saved = torch.load(path, weights_only=True)
+    assert saved["weights"]["encoder.mlp.weight"].shape[1] == 16 * 9
     del saved["args"]["vector_frequencies"]
     torch.save(saved, path)
     assert saved_args(ppo_gru.Args, read_model(path)).vector_frequencies == 0
+
+
+def test_flags_that_were_renamed(tiny):
+    """An older file has them by their former names."""
+    saved = {"args": {"head_size": 7, "seed": 3, "no_longer": 1}}
+    assert saved_args(ppo_gru.Args, saved) == ppo_gru.Args(trunk_size=7, seed=3)
 
 
 def test_logs_every_number_of_the_final_info(tiny, scalars):
@@ -322,14 +327,37 @@ def test_capture_video(tiny):
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_presets(script):
-    """What a preset holds is a default; what is given wins."""
+    """What a preset holds is a default; what is given wins. It is recorded, from Python too."""
     assert parse_args(script) == script.Args()
+    for name, held in script.PRESETS.items():
+        args = parse_args(script, "--preset", name)
+        assert args == script.Args(**held)
+        assert args.preset == name
+        check_args(args)
     held = script.PRESETS["laptop"]
-    laptop = parse_args(script, "--preset", "laptop")
-    assert laptop == script.Args(preset="laptop", **held)
     given = parse_args(script, "--num-steps", "7", "--preset=laptop", "--env-id", "CartPole-v1")
-    assert (given.num_steps, given.env_id, given.head_size) == (7, "CartPole-v1", held["head_size"])
-    check_args(laptop)
+    assert (given.num_steps, given.env_id, given.trunk_size) == (7, "CartPole-v1", held["trunk_size"])
+
+
+def test_the_last_lines(tiny, capsys):
+    """The folder with the score, and the commands that evaluate, watch and plot."""
+    args = tiny(env_id="MortarMayhemB-Grid-v0", total_timesteps=256, num_steps=64)
+    folder = ppo_gru.main(args)
+    score, *commands = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(rf"{folder}: 256 steps, return -?\d\.\d\d, mean of the last \d+ episodes", score)
+    checkpoint = folder / "checkpoint-256.pt"
+    assert commands == [
+        f"evaluate: python evaluate.py {checkpoint}",
+        f"watch: python enjoy.py {checkpoint} --out page.html",
+        f"plot: tensorboard --logdir {folder}",
+    ]
+    folder = ppo_gru.main(dataclasses.replace(args, eval_interval=1, eval_levels=2, save_model=True, exp_name="b"))
+    score, *commands = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(rf"{folder}: 256 steps, return -?\d\.\d\d on 2 unseen levels", score)
+    assert commands[0] == f"evaluate: python evaluate.py {folder / 'model.pt'}"
+    folder = ppo_gru.main(tiny(env_id="MysteryPath-v0", checkpoint_interval=0, exp_name="c"))
+    told = [f"{folder}: 128 steps, no episode ended", f"plot: tensorboard --logdir {folder}"]
+    assert capsys.readouterr().out.splitlines() == told
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
@@ -369,3 +397,5 @@ def test_help(script):
     for bounds in ("INT (1 or more)", "FLOAT (0 to 1)", "INT (0 to 16)", "FLOAT (above 0)"):
         assert bounds in said
     assert "--preset laptop stands for --obs-type vector" in said
+    assert "--preset quickstart stands for --obs-type vector" in said
+    assert """--env-options '{"command_count": [2],""" in said

@@ -13,6 +13,7 @@ TASK = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector", "save_model": T
 
 def test_rows_of_the_windows(tiny, monkeypatch, capsys):
     folder = ppo_trxl.main(tiny(ppo_trxl, **TASK))
+    capsys.readouterr()
     monkeypatch.chdir(folder)
     play, windows = evaluate.play, []
 

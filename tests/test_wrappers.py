@@ -12,7 +12,15 @@ from gymnasium.wrappers import FrameStackObservation, TransformObservation
 from players import choices
 
 from memory_gym_envs.searing_spotlights import BEND, START, TOWARD
-from ppo_utils.wrappers import GrayscaleStack, SpotlightPerturbation, StepEncoding, VectorStack, gray
+from ppo_utils.wrappers import (
+    FourierFeatures,
+    GrayscaleStack,
+    LastAction,
+    SpotlightPerturbation,
+    StepEncoding,
+    VectorStack,
+    gray,
+)
 
 LANES = 3
 SHORT = "Endless-MysteryPath-v0", "MortarMayhemB-Grid-v0"  # whose random episodes are; a picture and a Dict
@@ -432,3 +440,64 @@ def test_wrappers_compose():
         assert np.array_equal(left[0]["visual_observation"][..., -1], gray(right[0]["visual_observation"]))
         for (_, last), (_, other) in zip(finals(left[4]), finals(right[4]), strict=True):
             assert np.array_equal(last["visual_observation"][..., -1], gray(other["visual_observation"]))
+
+
+# ---- Fourier features ----
+class Vectors(gym.Env):
+    """A vector and a picture, at fixed values."""
+
+    observation_space = gym.spaces.Dict(
+        place=gym.spaces.Box(0.0, 1.0, (2,), np.float32), frame=gym.spaces.Box(0, 255, (40, 40, 3), np.uint8)
+    )
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.t += 1
+        return self.observe(), 0.0, self.t == 2, False, {}
+
+    def observe(self):
+        return {
+            "place": np.array([0.25, [1.0, 0.5, 0.0][self.t]], np.float32),
+            "frame": np.zeros((40, 40, 3), np.uint8),
+        }
+
+
+def test_fourier_features_by_hand():
+    """Of pi x and 2 pi x for each entry; the rest stays, and the final observation has them too."""
+    envs = FourierFeatures(SyncVectorEnv([Vectors] * 2, autoreset_mode=AutoresetMode.SAME_STEP), 2)
+    obs, _ = envs.reset(seed=1)
+    root = 0.5**0.5
+    assert list(envs.single_observation_space.spaces) == ["place", "frame", "sines", "cosines"]
+    assert envs.observation_space.contains(obs)
+    assert obs["place"].tolist() == [[0.25, 1.0]] * 2
+    np.testing.assert_allclose(obs["sines"], [[root, 1.0, 0.0, 0.0]] * 2, atol=1e-6)
+    np.testing.assert_allclose(obs["cosines"], [[root, 0.0, -1.0, 1.0]] * 2, atol=1e-6)
+    envs.step(np.zeros(2, int))
+    obs, _, terminated, _, infos = envs.step(np.zeros(2, int))
+    assert terminated.all()
+    np.testing.assert_allclose(obs["cosines"], [[root, 0.0, -1.0, 1.0]] * 2, atol=1e-6)
+    np.testing.assert_allclose(infos["final_obs"][1]["cosines"], [root, 0.0, 1.0, 1.0], atol=1e-6)
+
+
+def test_fourier_features_are_those_of_all_vectors():
+    """Two vectors, one after the other, as the network takes them."""
+    envs = LastAction(gym.make_vec("MysteryPath-Grid-v0", num_envs=2, obs_type="vector"))
+    features = FourierFeatures(envs, 3)
+    features.reset(seed=1)
+    obs, *_ = features.step(np.array([1, 3]))
+    x = np.concatenate([obs["last_action"], obs["observation"]], axis=1)
+    assert list(features.single_observation_space.spaces) == ["last_action", "observation", "sines", "cosines"]
+    for name, function in (("sines", np.sin), ("cosines", np.cos)):
+        wanted = [function(2**k * np.pi * x) for k in range(3)]
+        np.testing.assert_allclose(obs[name], np.stack(wanted, 2).reshape(2, -1), atol=1e-5)
+
+
+def test_fourier_features_without_a_vector():
+    envs = gym.make_vec("MysteryPath-v0", num_envs=2)
+    with pytest.raises(ValueError, match="FourierFeatures needs a vector to observe"):
+        FourierFeatures(envs, 2)
