@@ -43,12 +43,13 @@ def test_every_claim_compares_agents_that_can_be_trained(name):
 def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     small = "--num-envs 2 --num-steps 32 --num-minibatches 2 --trunk-size 8 --eval-levels 2"
     monkeypatch.setattr(learning, "COMMON", f"{learning.COMMON} {small}")
-    names = ("normalized-mortar-mayhem", "normalized-gradients")
-    config = claims.Config(claims=names, steps_scale=64 / 1e6, seeds=(1, 2), evaluations=1, folder=tmp_path / "runs")
+    config = claims.Config(
+        claims=("normalized-gradients",), steps_scale=64 / 1e6, seeds=(1, 2), evaluations=1, folder=tmp_path / "runs"
+    )
     config.results = tmp_path / "results"
     claims.main(config)
     told = capsys.readouterr().out
-    assert told.count("trained GRU") == 8
+    assert told.count("trained GRU") == 4
     agents = (claims.NORMALIZED, claims.NOT_NORMALIZED)
     norms = {}
     for agent in agents:
@@ -63,7 +64,7 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     claims.main(replace(config, report=True, seeds=(1, 2, 3)))
     told = capsys.readouterr().out
     assert "trained" not in told
-    assert told.count(" | not tested: 2 of 6 runs are missing |") == 2
+    assert told.count(" | not tested: 2 of 6 runs are missing |") == 1
 
 
 def test_the_page_has_the_rows_of_the_results_that_are_there(capsys):

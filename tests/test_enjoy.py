@@ -12,6 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -23,8 +24,10 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
 
 import enjoy
+import memory_gym_envs
 import ppo_gru
 import ppo_trxl
+from memory_gym_envs.character import PAD
 from ppo_utils.checkpoints import make_agent
 from ppo_utils.environments import as_tensors, envs_for
 
@@ -137,6 +140,44 @@ def test_the_episode_is_the_agents(flags, saved, monkeypatch):
         assert (terminated | truncated)[0] == (episode.finished and t == len(episode.actions) - 1)
     assert episode.finished
     assert episode.final["length"] == len(episode.actions)
+
+
+def test_the_entropy_is_that_of_all_branches(saved):
+    saved(env_id="MortarMayhem-v0", obs_type="vector")
+    episode = played()
+    for branches, entropy in zip(episode.policy, episode.entropies, strict=True):
+        assert len(branches) == 2
+        assert entropy == pytest.approx(-sum((p * np.log(p)).sum() for p in branches), rel=1e-5)
+
+
+MOVES = {"left": (-1, 0), "right": (1, 0), "up": (0, -1), "down": (0, 1), "none": (0, 0)}
+FACINGS = {"none": 0, "turn left": 2, "turn right": 6, "forward": 0}  # counter-clockwise from above, in eighths
+
+
+@pytest.mark.parametrize("env_id", memory_gym_envs.IDS)
+def test_actions_do_what_the_page_calls_them(env_id):
+    """From the middle of the field, and on a grid from facing up; in Mortar Mayhem once a command has been shown."""
+    env = gym.make(env_id).unwrapped
+    shown = 5 if "MortarMayhem-" in env_id else 0
+    options = {"command_count": [1]} if shown and "Endless" not in env_id else {}
+    sizes = getattr(env.action_space, "nvec", [getattr(env.action_space, "n", 0)])
+    idle = np.zeros(len(sizes), int)
+    names = enjoy.branch_names(env_id, [np.ones(size) for size in sizes])
+    for branch, (_, actions) in enumerate(names.items()):
+        for action, name in enumerate(actions):
+            env.reset(seed=1, options=options)
+            for _ in range(shown):
+                env.step(idle if len(sizes) > 1 else 0)
+            s = env.batch.state
+            s.pos[:] = 42 + PAD
+            s.facing[:] = 0
+            choice = np.where(np.arange(len(sizes)) == branch, action, 0)
+            env.step(choice if len(sizes) > 1 else action)
+            moved = tuple(np.sign(s.pos[0] - 42 - PAD).tolist())
+            if "forward" in actions:
+                assert (int(s.facing[0]), moved == (0, -1)) == (FACINGS[name], name == "forward"), name
+            else:
+                assert moved == MOVES[name], name
 
 
 def test_seed_is_the_level_and_the_actions(saved):

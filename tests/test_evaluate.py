@@ -176,7 +176,7 @@ def test_the_same_step_twice_is_refused():
         evaluate.agents_of(runs)
 
 
-@pytest.mark.parametrize("name", ["resume", "checkpoint_interval", "eval_interval"])
+@pytest.mark.parametrize("name", sorted(evaluate.BOOKKEEPING - {"seed"}))
 def test_how_a_run_was_kept_makes_no_other_agent(name):
     runs = {"a": arguments(**{name: "1"}), "b": arguments(seed=2, **{name: "2"})}
     assert evaluate.agents_of(runs) == {"ppo_gru": ["a", "b"]}
@@ -576,6 +576,35 @@ def test_several_files_of_a_run(agents, monkeypatch, capsys):
         "ppo_trxl": ["2/model.pt"],
     }
     assert "| return | ppo_gru step=512 | 2 |" in capsys.readouterr().out
+
+
+def test_the_share_of_finished_episodes(agents, monkeypatch, capsys):
+    played = iter([[1.0, 1.0], [0.0, 1.0]])
+
+    def play(checkpoint, config):
+        return {"return": np.zeros((2, 1)), "length": np.ones((2, 1)), "finished": np.array(next(played))[:, None]}
+
+    monkeypatch.setattr(evaluate, "play", play)
+    (task,) = evaluate.score_checkpoints(evaluate.Config(tuple(f"{folder}/model.pt" for folder in agents[:2]), **FEW))
+    assert task["finished"] == 0.75
+    assert "--max-steps cut 25.00% of the episodes;" in capsys.readouterr().out
+
+
+def test_a_result_has_what_tables_need():
+    """The family's metric, return, length and falls, by episode, and the seconds."""
+    with SummaryWriter("run") as writer:
+        writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|1|\n|env_id|MysteryPath-v0|")
+        for name in evaluate.SECONDS.values():
+            writer.add_scalar(name, 1.0, 10)
+        for name in ("success", "return", "length", "num_fails", "other"):
+            writer.add_tensor(f"eval_levels/{name}", torch.tensor([[1.0, 2.0]]), 10)
+    evaluate.write_run(evaluate.read_run("run"), "run.json.gz")
+    kept = evaluate.read_run("run.json.gz").curves
+    assert {name for name in kept if "eval" in name} == {
+        "eval/success", "eval/return", "eval/length", "eval/num_fails"
+    }  # fmt: skip
+    assert kept["eval/num_fails"][1].tolist() == [[[1.0, 2.0]]]
+    assert kept.keys() >= {*evaluate.SECONDS.values()}
 
 
 def test_episodes_cut_short(agents, capsys):

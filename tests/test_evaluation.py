@@ -10,10 +10,31 @@ from conftest import SCRIPTS
 
 import ppo_gru
 import ppo_trxl
-from ppo_utils import evaluation
+from ppo_utils import evaluation, runs
 from ppo_utils.environments import envs_for
 from ppo_utils.evaluation import evaluate, evaluation_levels
 
+
+class Numbered(gym.Env):
+    """Reports the number of the episode; the first has seed % 5 + 1 steps, and each other one step more."""
+
+    observation_space = gym.spaces.Box(0.0, 1.0, (1,))
+    action_space = gym.spaces.Discrete(2)
+    number = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if seed is not None:
+            self.number, self.length = 0, seed % 5
+        self.number, self.length, self.t = self.number + 1, self.length + 1, 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        return np.zeros(1, np.float32), 1.0, self.t == self.length, False, {"number": self.number}
+
+
+gym.register("Numbered-v0", entry_point=Numbered)
 EACH_SCRIPT = pytest.mark.parametrize("script", SCRIPTS)
 FEW = {"eval_levels": 2, "num_levels": 10, "start_level": 5}
 
@@ -93,29 +114,49 @@ def test_training_goes_on_as_if_there_had_been_none(tiny, curves, script):
         assert evaluated[name] == without[name], name
 
 
-def test_other_environments_are_evaluated_too(tiny, scalars):
-    curves = scalars(ppo_gru.main(tiny(env_id="CueRecall-v0", eval_interval=1, **FEW)))
-    assert len(curves["eval/right"]) == 2
-    assert all(0 <= share <= 1 for share in curves["eval/right"])
+def test_an_episode_is_an_environment_s_first(played):
+    """Those that follow while others play on count nowhere."""
+    args, run, *_ = played(env_id="Numbered-v0", num_levels=0, start_level=0)
+    found = evaluate(run.agent, envs_for(args, 5), [0, 1, 2, 3, 4], 100)
+    assert found["number"].tolist() == [1, 1, 1, 1, 1]
+    assert found["length"].tolist() == found["return"].tolist() == [1, 2, 3, 4, 5]
+    found = evaluate(run.agent, envs_for(args, 5), [0, 1, 2, 3, 4], 3)
+    assert found["number"].tolist()[:3] == [1, 1, 1]
+    assert np.isnan(found["number"][3:]).all()
+    assert found["finished"].tolist() == [1, 1, 1, 0, 0]
+
+
+def test_what_is_logged_of_an_evaluation(tiny, curves, monkeypatch):
+    """Levels by repeats, and the mean; what some episode did not report is left out."""
+    numbers = np.arange(6.0)
+    told = {"return": numbers, "steps": numbers, "success": np.where(numbers == 4, np.nan, numbers)}
+    monkeypatch.setattr(runs, "evaluate", lambda *_: told)
+    found = curves(ppo_gru.main(tiny(env_id="CueRecall-v0", eval_interval=2, **FEW)))
+    assert found["eval/return"] == [(128, 2.5)]
+    assert found["eval_levels/return"] == [(128, [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])]
+    assert {name for name in found if "eval" in name} == {
+        "eval/return", "eval/steps", "eval_levels/return", "eval_levels/steps"
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("changes", "shape"),
+    ("changes", "parts"),
     [
         ({"env_id": "MortarMayhem-Grid-v0", "frame_stack": 4}, {"observation": (84, 84, 4)}),
-        ({"env_id": "MortarMayhem-Grid-v0", "obs_type": "vector"}, None),
-        ({"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "frame_stack": 16, "step_encoding": True}, None),
+        ({"env_id": "MortarMayhem-Grid-v0", "obs_type": "vector"}, {"observation": (24,)}),
+        (
+            {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "frame_stack": 16, "step_encoding": True},
+            {"observation": (16 * 16,), "step_encoding": (16,)},
+        ),
         (
             {"env_id": "MortarMayhemB-Grid-v0", "step_encoding": True},
             {"visual_observation": (84, 84, 3), "vector_observation": (180,), "step_encoding": (16,)},
         ),
     ],
 )
-@EACH_SCRIPT
-def test_the_minor_baselines_observe_and_train(tiny, scalars, script, changes, shape):
-    """6.2.1, and vectors: what is observed is trained on, evaluated and saved."""
-    args = tiny(script, eval_interval=2, **FEW, **changes, eval_max_steps=5)
-    envs = envs_for(args, 2)
-    parts = {name: part.shape for name, part in envs.single_observation_space.items()}
-    assert shape is None or parts == shape
-    assert len(scalars(script.main(args))["eval/return"]) == 1
+def test_the_minor_baselines_observe_and_train(played, changes, parts):
+    """6.2.1, and vectors: what is observed is what the network takes, and what an evaluation shows it."""
+    args, run, *_ = played(memory="none", **FEW, **changes)
+    assert {name: part.shape for name, part in run.envs.single_observation_space.items()} == parts
+    assert {name: tuple(part.shape[2:]) for name, part in run.rollout.obs.items()} == parts
+    assert evaluated(args, run, max_steps=3)["length"].tolist() == [3] * 6

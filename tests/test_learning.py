@@ -198,6 +198,31 @@ def test_a_training_that_is_about_to_begin_is_stopped_too(tmp_path, monkeypatch)
     assert not learning.RUNNING
 
 
+@pytest.mark.parametrize(
+    ("total", "last", "complete"), [(96, 64, False), (96, 96, True), (100, 64, False), (100, 96, True)]
+)
+def test_a_run_is_complete_when_no_iteration_is_left(total, last, complete):
+    """Of 32 steps each."""
+    seconds = {name: (np.array([last]), np.ones((1, 1, 1))) for name in evaluate.SECONDS.values()}
+    args = {"total_timesteps": str(total), "num_envs": "4", "num_steps": "8"}
+    assert learning.is_complete(evaluate.RunLog("run", args, seconds)) == complete
+
+
+@pytest.mark.parametrize("last", [None, 64])
+def test_a_run_without_a_score_at_its_end_is_no_result(last, tmp_path, monkeypatch):
+    config = learning.Config(folder=tmp_path, results=tmp_path)
+    plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", 1)
+    end = plan.args.total_timesteps // 4096 * 4096
+    curves = {name: (np.array([end]), np.ones((1, 1, 1))) for name in evaluate.SECONDS.values()}
+    if last is not None:  # an earlier evaluation had one
+        curves["eval/commands_completed"] = np.array([last]), np.ones((1, 1, 1))
+    run = evaluate.RunLog("run", plan.logged_args(), curves)
+    monkeypatch.setattr(learning, "runs_in", lambda place, plan: [run])
+    with pytest.raises(SystemExit, match=r"GRU on .*, has no commands_completed at its end: an evaluation was cut"):
+        learning.write_result(config, plan)
+    assert not list(tmp_path.iterdir())
+
+
 def test_runs_share_the_cores_unless_told_how_many_threads_to_have(tmp_path, monkeypatch):
     config = learning.Config(jobs=1, folder=tmp_path)
     plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", 1)

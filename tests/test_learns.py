@@ -44,14 +44,14 @@ def test_recurrent_memory(tiny, trained, memory):
 
 @pytest.mark.slow
 def test_no_memory(tiny, trained):
-    args = tiny(memory="none", hidden_size=64, **SETTINGS | {"total_timesteps": STEPS * 2 // 5})
+    args = tiny(memory="none", hidden_size=64, **SETTINGS | {"total_timesteps": STEPS // 5})
     assert 0.4 <= trained(ppo_gru, args) <= 0.6
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("encoding", "gate"),
-    [("absolute", "none"), ("learned", "none"), ("relative", "none"), ("none", "none"), ("absolute", "gru")],
+    [("absolute", "none"), ("learned", "gru"), ("relative", "none"), ("none", "none")],
 )
 def test_transformer_memory(tiny, trained, encoding, gate):
     args = tiny(ppo_trxl, trxl_positional_encoding=encoding, trxl_gate=gate, **WINDOW, **SETTINGS)
@@ -59,6 +59,5 @@ def test_transformer_memory(tiny, trained, encoding, gate):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("script", "memory"), [(ppo_gru, {"hidden_size": 64}), (ppo_trxl, WINDOW)])
-def test_with_bfloat16(tiny, trained, script, memory):
-    assert trained(script, tiny(script, **memory, **SETTINGS, amp=True)) >= 0.95
+def test_with_bfloat16(tiny, trained):
+    assert trained(ppo_trxl, tiny(ppo_trxl, **WINDOW, **SETTINGS, amp=True)) >= 0.95

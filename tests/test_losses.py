@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,6 +18,13 @@ def test_policy_loss_clips_every_branch_by_itself():
     assert policy_loss(log_ratio, torch.tensor([2.0]), 0.1).item() == pytest.approx(-(2.2 + 1.8) / 2)
     # A negative advantage takes the pessimistic side: min(-3, -2.2) and min(-1.8, -1.8).
     assert policy_loss(log_ratio, torch.tensor([-2.0]), 0.1).item() == pytest.approx((3.0 + 1.8) / 2)
+
+
+def test_policy_loss_is_pessimistic_below_the_range_too():
+    # Ratio 0.5, advantage -2, clip 0.1: min(0.5 * -2, 0.9 * -2); with advantage 2: min(0.5 * 2, 0.9 * 2).
+    log_ratio = torch.tensor([[math.log(0.5)]])
+    assert policy_loss(log_ratio, torch.tensor([-2.0]), 0.1).item() == pytest.approx(1.8)
+    assert policy_loss(log_ratio, torch.tensor([2.0]), 0.1).item() == pytest.approx(-1.0)
 
 
 def test_policy_gradient_vanishes_only_in_the_clipped_branch():
@@ -87,6 +95,63 @@ def test_the_total_loss_is_composed_as_in_equation_5_7(played):
     normalize = dataclasses.replace(args, norm_adv="minibatch")
     normalized = ppo_loss(agent, rollout, pieces, 5.0, normalize)[1]
     assert normalized["policy_loss"].item() == pytest.approx(0.0, abs=1e-5), "advantages of mean zero"
+
+
+@pytest.mark.parametrize("clip_vloss", [True, False])
+def test_values_are_clipped_around_the_rollout_s(played, clip_vloss):
+    """All returns are 2 above the rollout's values, and the present values 1: clipped at 0.1, they miss 1.9."""
+    args, run, *_ = played(env_id="CueRecall-v0", clip_vloss=clip_vloss, clip_coef=0.1)
+    rollout, agent = run.rollout, run.agent
+    pieces = agent.memory.cut(rollout.terminated)
+    rollout.values -= 1
+    rollout.returns = rollout.values + 2
+    logs = ppo_loss(agent, rollout, pieces, 0.0, args)[1]
+    assert logs["value_loss"].item() == pytest.approx(1.9**2 if clip_vloss else 1.0, rel=1e-4)
+
+
+PROBES = {"ground_truth_coef": 100.0, "ground_truth_detach": True}
+
+
+@pytest.mark.parametrize("max_grad_norm", [0.25, 1e9])
+def test_a_gradient_step_is_no_longer_than_its_norm_allows(played, max_grad_norm):
+    """By plain gradient descent with rate 1, a step is the gradient; that of a detached head is clipped by itself."""
+    changes = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector", "num_minibatches": 1, "update_epochs": 1}
+    args, run, *_ = played(**changes, **PROBES, max_grad_norm=max_grad_norm)
+    rollout, agent = run.rollout, run.agent
+    rollout.returns = rollout.values + 100
+    before = {name: weight.clone() for name, weight in agent.state_dict().items()}
+    (logs,) = ppo_gru.update(agent, torch.optim.SGD(agent.parameters(), lr=1.0), rollout, 0.0, args)
+    steps = {name: (weight - before[name]).flatten() for name, weight in agent.state_dict().items()}
+    for of_probe in (False, True):
+        step = torch.cat([step for name, step in steps.items() if name.startswith("estimator") == of_probe]).norm()
+        assert step > 0.2
+        assert (step <= max_grad_norm * 1.001) if max_grad_norm < 1 else (step > 2)
+        if not of_probe:
+            assert logs["grad_norm"] > 2, "what is logged is the norm before it is clipped"
+            assert step.item() == pytest.approx(min(max_grad_norm, logs["grad_norm"].item()), rel=1e-3)
+
+
+def test_logs_are_means_over_gradient_steps():
+    steps = [{"loss": 1.0, "grad_norm": 2.0, "ratio_error": 0.25}, {"loss": 4.0, "grad_norm": 6.0, "ratio_error": 9.0}]
+    steps = [{name: torch.tensor(value) for name, value in step.items()} for step in steps]
+    values = torch.tensor([[0.0], [1.0]])
+    found = ppo_gru.mean_logs(steps, SimpleNamespace(values=values, returns=values))
+    assert found == {
+        "losses/loss": 2.5,
+        "losses/grad_norm": 4.0,
+        "losses/ratio_error": 0.25,  # before the first gradient step
+        "losses/explained_variance": 1.0,
+        "charts/gradient_steps": 2,
+    }
+
+
+@pytest.mark.parametrize("name", ["loss", "grad_norm"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_one_number_that_is_not_finite_ends_the_training(name, value):
+    steps = [{"loss": torch.tensor(1.0), "grad_norm": torch.tensor(1.0), "ratio_error": torch.tensor(0.0)}] * 3
+    steps = [*steps, steps[0] | {name: torch.tensor(value)}]
+    with pytest.raises(FloatingPointError, match="the loss or its gradient is not finite"):
+        ppo_gru.mean_logs(steps, SimpleNamespace(values=torch.zeros(2), returns=torch.zeros(2)))
 
 
 def test_advantages_are_normalized_by_minibatch_or_by_rollout(played, monkeypatch):

@@ -383,10 +383,18 @@ def test_acting_and_learning_ask_no_device_for_numbers(played, monkeypatch, memo
     assert all(parameter.grad.device.type == "meta" for parameter in agent.parameters())
 
 
-@pytest.mark.parametrize("env_id", ["CueRecall-v0", "Endless-MortarMayhem-v0"])
+REFRESHED = {
+    "terminated": {"env_id": "CueRecall-v0"},
+    "truncated": {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"max_steps": 5}', "obs_type": "vector"},
+    "neither": {"env_id": "Endless-MortarMayhem-v0"},
+}
+
+
+@pytest.mark.parametrize("ends", REFRESHED)
 @each_memory(MEMORIES)
-def test_refreshing_with_the_weights_that_acted_changes_nothing(played, env_id, memory):
-    args, run, *_ = played(iterations=3, env_id=env_id, **memory)
+def test_refreshing_with_the_weights_that_acted_changes_nothing(played, ends, memory):
+    args, run, *_ = played(iterations=3, **REFRESHED[ends], **memory)
+    assert ends == "neither" or getattr(run.rollout, ends).any()
     before = copy.deepcopy(vars(run.rollout.memory))
     memory.get("script", ppo_gru).refresh_memory(run.agent, run.rollout, args)
     for name, now in vars(run.rollout.memory).items():

@@ -75,6 +75,60 @@ def test_defaults_are_the_final_column_of_table_6_1():
     assert {name: getattr(ppo_trxl.Args(), name) for name in trxl} == trxl
 
 
+@pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
+def test_the_optimizer(tiny, opened, script):
+    """AdamW with torch's default decay for all weights, at the first learning rate."""
+    run = opened(script, tiny(script, env_id="CueRecall-v0", init_lr=0.125))
+    (group,) = run.optimizer.param_groups
+    assert isinstance(run.optimizer, torch.optim.AdamW)
+    assert {*group["params"]} == {*run.agent.parameters()}
+    assert (group["weight_decay"], float(group["lr"]), group["betas"]) == (0.01, 0.125, (0.9, 0.999))
+
+
+@pytest.mark.parametrize("memory", ["gru", "lstm"])
+def test_initialization_of_recurrent_layers(memory):
+    """Orthogonal with gain 1 where the matrices of all gates are stacked: columns have norm 1; biases are 0."""
+    torch.manual_seed(0)
+    rnn = ppo_gru.Memory(Args(memory=memory, hidden_size=64, num_layers=2), 64).rnn
+    for name, parameter in rnn.named_parameters():
+        if "bias" in name:
+            assert parameter.eq(0).all()
+        else:
+            torch.testing.assert_close(parameter.T @ parameter, torch.eye(64), atol=1e-5, rtol=0)
+
+
+def test_initialization_of_the_network():
+    """Gains of the thesis' code: square root of 2, 0.1 for the policy's last layer, 1 for the value's; biases are 0."""
+    torch.manual_seed(0)
+    agent = Agent(PIXELS, [4], Args())
+    gains = {agent.encoder.embedding: 2, agent.heads.trunk: 2, agent.heads.policy[0]: 2, agent.heads.policy[2]: 0.01}
+    for layer, square in {**gains, agent.heads.value[0]: 2, agent.heads.value[2]: 1}.items():
+        weight = layer.weight if layer.weight.shape[0] <= layer.weight.shape[1] else layer.weight.T
+        torch.testing.assert_close(weight @ weight.T, square * torch.eye(len(weight)), atol=1e-4, rtol=0)
+        assert layer.bias.eq(0).all()
+
+
+def test_the_spread_of_a_fresh_learned_encoding():
+    """N(0, 1 / D): an encoding has a norm of about 1."""
+    torch.manual_seed(0)
+    memory = ppo_trxl.Memory(ppo_trxl.Args(trxl_positional_encoding="learned"), 384)
+    assert memory.table.shape == (2049, 384)
+    assert memory.table.std().item() == pytest.approx(384**-0.5, rel=0.01)
+
+
+def test_the_gate_by_its_equations():
+    """Those of Parisotto et al. (2020), section 3.2, as docs/memory.md has them."""
+    torch.manual_seed(0)
+    gate = ppo_trxl.Gate(6, 2.0).double()
+    x, y = torch.randn(2, 4, 3, 6, dtype=torch.float64)
+    w_r, w_z, w_h = (matrix.T for matrix in gate.from_y.weight.split(6))
+    u_r, u_z = (matrix.T for matrix in gate.from_x.weight.split(6))
+    r = 1 / (1 + torch.exp(-(y @ w_r + x @ u_r)))
+    z = 1 / (1 + torch.exp(-(y @ w_z + x @ u_z - 2.0)))
+    h = torch.tanh(y @ w_h + (r * x) @ gate.candidate.weight.T)
+    torch.testing.assert_close(gate(x, y), (1 - z) * x + z * h, atol=1e-12, rtol=0)
+
+
 def test_chunks_do_not_change_the_features(monkeypatch):
     torch.manual_seed(0)
     cnn, pixels = AtariCNN(3), torch.randint(0, 256, (10, 84, 84, 3), dtype=torch.uint8)

@@ -4,6 +4,7 @@ import errno
 import itertools
 import os
 import pickle
+import random
 import re
 import signal
 import subprocess
@@ -21,7 +22,7 @@ import enjoy
 import evaluate
 import ppo_gru
 import ppo_trxl
-from ppo_utils import runs
+from ppo_utils import checkpoints, runs
 from ppo_utils.checkpoints import model_of, read_checkpoint, read_model, write_file
 from ppo_utils.processes import RunError
 
@@ -215,6 +216,59 @@ def test_environments_of_other_packages_begin_new_episodes(tiny, opened, curves,
     assert [step for step, _ in curves(folder)["losses/loss"]] == [64, 128, 192, 256, 320]
 
 
+def test_what_else_a_run_goes_on_with(tiny, opened):
+    """NumPy's and Python's generators, the seconds, and the last returns and lengths of the progress bar."""
+    args = tiny(env_id="CartPole-v1", total_timesteps=256)
+    run = opened(ppo_gru, args)
+    ppo_gru.train(tiny(env_id="CartPole-v1", checkpoint_interval=0), run)
+    np.random.seed(5)  # noqa: NPY002
+    random.seed(6)
+    checkpoints.save_checkpoint(args, run)
+    wanted = np.random.rand(), random.random(), torch.rand(1).item()  # noqa: NPY002
+    runs.close(run)
+    again = opened(ppo_gru, parse_args(ppo_gru, "--resume", str(run.folder)))
+    assert (np.random.rand(), random.random(), torch.rand(1).item()) == wanted  # noqa: NPY002
+    assert (again.step, again.seconds) == (run.step, run.seconds)
+    assert run.seconds > 0
+    assert (list(again.returns), list(again.lengths)) == (list(run.returns), list(run.lengths))
+    assert run.returns
+
+
+def test_curves_are_there_before_their_checkpoint(tiny, curves, monkeypatch):
+    """A kill right after a checkpoint leaves no gap: the run goes on after what was logged."""
+    seen, write = [], checkpoints.write_file
+
+    def write_file(saved, path):
+        seen.append((saved["step"], curves(path.parent)["losses/loss"][-1][0]))
+        write(saved, path)
+
+    monkeypatch.setattr(checkpoints, "write_file", write_file)
+    ppo_gru.main(tiny(**GRID, checkpoint_interval=1))
+    assert seen == [(64, 64), (128, 128)]
+
+
+def test_files_of_a_process_that_was_killed_while_it_wrote(trained):
+    """They go when the run goes on, and are no checkpoint."""
+    leftover = trained / "checkpoint-192.pt.part"
+    leftover.write_bytes(b"half of a file")
+    assert resumed(ppo_gru, trained, "--total-timesteps", "192") == trained
+    assert not leftover.exists()
+    assert read_checkpoint(trained)["step"] == 192
+
+
+def test_a_checkpoint_holds_what_the_next_rollout_begins_with(tiny):
+    """Of the transformer's timeline the window, not the rollout; of the GRU's hidden states the last."""
+    changes = {"num_steps": 64, "total_timesteps": 256}
+    folder = ppo_trxl.main(tiny(ppo_trxl, **GRID, **changes))
+    memory = read_checkpoint(folder)["processes"][0]["memory"]
+    assert {name: tuple(part.shape) for name, part in memory.items()} == {
+        "hidden": (7, 4, 3, 32), "stored_step": (7, 4), "episode_step": (4,)
+    }  # fmt: skip
+    folder = ppo_gru.main(tiny(**GRID, **changes))
+    (hidden,) = read_checkpoint(folder)["processes"][0]["memory"].values()
+    assert hidden.shape == (4, 1, 32)
+
+
 def test_videos_go_on(tiny, monkeypatch):
     pytest.importorskip("moviepy")
     args = tiny(env_id="MortarMayhemB-Grid-v0", total_timesteps=8 * 64, capture_video=True)
@@ -240,10 +294,10 @@ def test_a_second_interrupt_ends_the_training_at_once(tiny, opened, monkeypatch)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_to_the_command(tiny, curves, tmp_path, number):
+def test_a_signal_to_the_command(curves, tmp_path, number):
     """As a cluster sends it at a time limit: checkpoint and model are written, and the curve goes on."""
-    flags = [*FEW, "--num-steps", "32", "--total-timesteps", "6400"]
-    command = [sys.executable, ppo_gru.__file__, *flags, "--save-model"]
+    flags = [*FEW, "--num-steps", "32", "--total-timesteps", "640000", "--save-model"]
+    command = [sys.executable, ppo_gru.__file__, *flags]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
         deadline = threading.Timer(200, process.kill)
         deadline.start()
@@ -255,13 +309,8 @@ def test_a_signal_to_the_command(tiny, curves, tmp_path, number):
     assert process.returncode == 128 + number, said
     assert "Traceback" not in said
     (folder,) = tmp_path.glob("runs/*")
-    (checkpoint,) = folder.glob("checkpoint-*.pt")
-    assert read_model(checkpoint)["step"] == read_model(folder / "model.pt")["step"] < 6400
-    done = subprocess.run(
-        [sys.executable, ppo_gru.__file__, "--resume", str(folder)], cwd=tmp_path, stderr=subprocess.PIPE, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    assert curves(folder) == curves(ppo_gru.main(parse_args(ppo_gru, *flags)))
+    step = curves(folder)["losses/loss"][-1][0]
+    assert read_model(folder / "model.pt")["step"] == read_checkpoint(folder)["step"] == step < 640_000
 
 
 CONTRADICTIONS = {

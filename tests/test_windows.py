@@ -58,6 +58,32 @@ def make_timeline(memory, seed=1):
     return replace(fresh(memory), now=rows, hidden=hidden, stored_step=steps)
 
 
+def encoded(memory, step):
+    """The encoding of a step, number by number (2.57, 2.58), or the learned one."""
+    if memory.encoding == "learned":
+        return memory.table[min(step, len(memory.table) - 1)]
+    angles = [step / 10000 ** (2 * (i // 2) / WIDTH) for i in range(WIDTH)]
+    return torch.tensor([math.cos(a) if i % 2 else math.sin(a) for i, a in enumerate(angles)], dtype=torch.float64)
+
+
+def normed(layer, x):
+    """What a layer norm makes of x (..., D), or x where there is none."""
+    if isinstance(layer, torch.nn.Identity):
+        return x
+    deviation = (x.var(-1, correction=0, keepdim=True) + 1e-5).sqrt()
+    return (x - x.mean(-1, keepdim=True)) / deviation * layer.weight + layer.bias
+
+
+def merged(merge, x, y):
+    """The sum of x and y, or what a gate makes of them (Parisotto et al., 2020)."""
+    if merge is torch.add:
+        return x + y
+    w_r, w_z, w_h = merge.from_y.weight.split(WIDTH)
+    u_r, u_z = merge.from_x.weight.split(WIDTH)
+    r, z = torch.sigmoid(w_r @ y + u_r @ x), torch.sigmoid(w_z @ y + u_z @ x - merge.bias)
+    return (1 - z) * x + z * torch.tanh(w_h @ y + merge.candidate.weight @ (r * x))
+
+
 def naive(memory, x, row, lane, stored, own=None):
     """One sample: gather its window, project it, attend with a softmax that is written out.
 
@@ -67,40 +93,40 @@ def naive(memory, x, row, lane, stored, own=None):
     step = int(stored.stored_step[row, lane])
     window = min(step, memory.window)
     at = torch.arange(row - window, row)
-    told = torch.zeros_like(x)
+    added = torch.zeros_like(x)
     if memory.query_position:
-        told = told + (memory.table[step] if memory.encoding == "learned" else sinusoid(torch.tensor(step), WIDTH))
+        added = added + encoded(memory, step)
     if memory.query_output is not None and step > 0:
-        told = told + memory.query_output.weight @ stored.hidden[row - 1, lane, -1]
+        added = added + memory.query_output.weight @ stored.hidden[row - 1, lane, -1]
     inputs = []
     for k, block in enumerate(memory.blocks):
         attention = block.attention
         inputs.append(x)
-        items = stored.hidden[at, lane, k]
+        attended_to = stored.hidden[at, lane, k]
         if own:
             recent = torch.stack([each[k] for each in own])[-window or len(own) :]
-            items = torch.cat([items[: window - len(recent)], recent])
-        items = items + memory.position(stored.stored_step[at, lane], x.dtype)
-        normed, query = items, x + (told if k == 0 else 0.0)
-        if isinstance(block.norm_query, torch.nn.LayerNorm):  # behind attention and projection instead: figure 2.11a
-            normed, query = block.norm_items(items), block.norm_query(query)
+            attended_to = torch.cat([attended_to[: window - len(recent)], recent])
+        if memory.encoding in ("absolute", "learned") and window:
+            steps = stored.stored_step[at, lane].tolist()
+            attended_to = attended_to + torch.stack([encoded(memory, each) for each in steps])
+        keys_of = normed(block.norm_items, attended_to)
+        query = normed(block.norm_query, x + added if k == 0 else x)
         heads, size = [], WIDTH // attention.num_heads
         for h in range(attention.num_heads):
             of = slice(h * size, (h + 1) * size)
             w_q, w_k, w_v = (layer.weight[of].T for layer in (attention.query, attention.key, attention.value))
-            scores = query @ w_q @ (normed @ w_k).T
-            if memory.encoding == "relative":  # the four terms of (2.61)
-                r = sinusoid(row - at, WIDTH)
+            scores = query @ w_q @ (keys_of @ w_k).T
+            if memory.encoding == "relative" and window:  # the four terms of (2.61)
+                r = torch.stack([encoded(memory, age) for age in (row - at).tolist()])
                 u, v = attention.content_bias, attention.position_bias
-                scores = scores + query @ w_q @ (r @ w_k).T + u @ w_q @ (normed @ w_k).T + v @ w_q @ (r @ w_k).T
-            heads.append((scores / math.sqrt(size)).softmax(-1) @ (normed @ w_v))
-        attended = attention.output(torch.cat(heads)) if window else torch.zeros_like(x)
-        x = block.merge_attention(x, attended)
-        if isinstance(block.norm_query, torch.nn.LayerNorm):
-            x = block.merge_output(x, F.relu(block.projection(block.norm_output(x))))
-        else:
-            x = block.after_attention(x)
-            x = block.after_projection(block.merge_output(x, F.relu(block.projection(x))))
+                scores = scores + query @ w_q @ (r @ w_k).T + u @ w_q @ (keys_of @ w_k).T + v @ w_q @ (r @ w_k).T
+            heads.append((scores / math.sqrt(size)).softmax(-1) @ (keys_of @ w_v))
+        attended = torch.zeros_like(x)
+        if window:
+            attended = attention.output.weight @ torch.cat(heads) + attention.output.bias
+        x = normed(block.after_attention, merged(block.merge_attention, x, attended))
+        projected = F.relu(block.projection.weight @ normed(block.norm_output, x) + block.projection.bias)
+        x = normed(block.after_projection, merged(block.merge_output, x, projected))
     if own is not None:
         own.append(inputs)
     return x

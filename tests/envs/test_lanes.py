@@ -166,3 +166,24 @@ def test_lanes_with_different_options_differ():
     assert black[1] < 0.01 < black[0] < 0.4 < black[2]
     bodies = (observations == (250, 204, 153)).all(axis=-1).sum(axis=(1, 2))
     assert bodies[1] > 4 * bodies[0] > 0
+
+
+SHORT = {"Endless-MortarMayhem-v0": 20, "MysteryPath-v0": 12, "MysteryPath-Grid-v0": 12, "Endless-MysteryPath-v0": 8}
+
+
+@EACH_OBS
+def test_an_episode_begins_as_in_an_environment_that_was_never_used(env_id, obs_type):
+    """Nothing of the episode before is left on the first picture, wherever a player got to."""
+    options = {"max_steps": SHORT[env_id]} if env_id in SHORT else {}
+    options |= {"show_past_path": True} if "Endless-MysteryPath" in env_id else {}
+    envs = gym.make_vec(env_id, num_envs=LANES, obs_type=obs_type, num_levels=1000)
+    envs.reset(seed=4, options=options)
+    rng, begun = np.random.default_rng(0), 0
+    for _ in range(150):
+        obs, *_, infos = envs.step(stumbling(envs, rng, np.linspace(0, 1, LANES)))
+        for lane in np.flatnonzero(infos.get("_final_obs", ())).tolist():
+            fresh = gym.make_vec(env_id, num_envs=1, obs_type=obs_type)
+            wanted, _ = fresh.reset(seed=int(envs.np_random_seed[lane]), options=options)
+            check_same(lane_of(obs, lane), lane_of(wanted, 0))
+            begun += 1
+    assert begun > 3

@@ -46,6 +46,17 @@ def test_player_completes_every_command(env_id, seed):
     assert info["commands_completed"] == 1.0
 
 
+def test_a_failure_at_the_step_limit_is_a_failure():
+    """Terminated only, as in the other families; one step earlier, the limit comes first."""
+    env = gym.make("Endless-MortarMayhem-v0").unwrapped
+    idle = np.zeros(env.action_space.shape, np.int64)
+    rewards, *ends, _ = play_out(env, lambda: idle, 3)
+    assert ends == [True, False]
+    for limit, wanted in ((len(rewards), [True, False]), (len(rewards) - 1, [False, True])):
+        found, *ends, _ = play_out(env, lambda: idle, 3, {"max_steps": limit})
+        assert (len(found), ends) == (limit, wanted)
+
+
 @pytest.mark.parametrize("env_id", BOUNDS)
 def test_idle_agent_fails_at_the_first_command_that_moves(env_id):
     env = gym.make(env_id).unwrapped

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from helpers import EACH, MORTAR
-from players import FAMILY, player, stumbling
+from players import FAMILY, player, spot_player, stumbling
 
 from memory_gym_envs import IDS, MortarMayhem, MysteryPath, SearingSpotlights
 from memory_gym_envs.base import ALL
@@ -17,6 +17,7 @@ from memory_gym_envs.character import FACINGS, PAD
 from memory_gym_envs.entries import vector_slices, vector_space
 from memory_gym_envs.mortar_mayhem import COMMANDS, SYMBOL, SYMBOL_AT
 from memory_gym_envs.mystery_path import PIT_ROWS, ROWS, SIDE
+from memory_gym_envs.searing_spotlights import AGENT, COIN, EXIT
 
 LANES, STEPS = 48, 120
 OPTIONS = {  # played one after the other, each by the ids that have its options
@@ -348,3 +349,95 @@ def test_stamina_and_background():
         envs.step(player(envs))
     _, _, entries = made("Endless-MysteryPath-v0")
     assert not np.concatenate([entries(name) for name in ("ground", "bar", "stamina", "cross", "past", "scroll")]).any()
+
+
+# ---- what entries of Searing Spotlights say, against the state and the picture ----
+NO_LIGHTS = {
+    "SearingSpotlights-v0": {"initial_spawns": 0, "num_spawns": 0},
+    "Endless-SearingSpotlights-v0": {"initial_spawns": 0, "spawn_interval": 1000},
+}
+IN_VIEW = {"agent_visible": True, "coins_visible": True}
+EIGHT = ("up", "up-left", "left", "down-left", "down", "down-right", "right", "up-right")
+WAYS = {"none": (0, 0), "left": (1, 0), "right": (2, 0), "up": (0, 1), "down": (0, 2)}
+WAYS |= {"up-left": (1, 1), "down-left": (1, 2), "down-right": (2, 2), "up-right": (2, 1)}
+
+
+@pytest.mark.parametrize("env_id", SearingSpotlights.variants)
+def test_the_action_in_the_bar(env_id):
+    """One-hot, horizontal and vertical, of the step before the last one, as in the original; and the facing it gave."""
+    envs, _, entries = made(env_id, seed=1, **NO_LIGHTS[env_id], **IN_VIEW)
+    before = (0, 0)
+    for name in (*WAYS, "none"):
+        envs.step(np.array([WAYS[name]]))
+        assert (entries("horizontal").argmax(), entries("vertical").argmax()) == before
+        assert entries("horizontal").sum() == entries("vertical").sum() == 1
+        if name != "none":
+            assert EIGHT[int(entries("facing").argmax())] == name
+        assert entries("facing").sum() == 1
+        before = WAYS[name]
+
+
+@pytest.mark.parametrize("env_id", SearingSpotlights.variants)
+def test_places_in_the_light(env_id):
+    """Of the agent, the first coin and the exit: pixels over 144, then x and y of the middle, which differ."""
+    finite = env_id == "SearingSpotlights-v0"
+    options = {"exit_visible": True} if finite else {"coin_show_duration": 1000}
+    envs, s, entries = made(env_id, seed=2, **NO_LIGHTS[env_id], **IN_VIEW, **options)
+    bodies = {"agent": AGENT, "coin": COIN} | ({"exit": EXIT} if finite else {})
+    rng, apart = np.random.default_rng(0), 0
+    for _ in range(25):
+        envs.step(rng.integers(0, 3, (1, 2)))
+        for name, body in bodies.items():
+            size, *middle = entries(name)
+            assert size > 0.1, name
+            assert np.array(middle) * 84 == pytest.approx(s.bodies[:, 0, body], abs=2.5), name
+            apart += abs(middle[0] - middle[1]) > 0.1
+    assert apart > 25
+
+
+@pytest.mark.parametrize("env_id", SearingSpotlights.variants)
+def test_health_and_reward_in_the_bar(env_id):
+    """The bar's left half is green by the share of health that is left; its right half yellow after a reward."""
+    envs, s, entries = made(env_id, seed=3, initial_spawns=40, agent_health=200, **IN_VIEW)
+    health, rewarded, gain = [], [], 0.0
+    for t in range(160):  # the lights come first, then the coins
+        _, rewards, *_, infos = envs.step(spot_player(envs) if t > 80 else np.zeros((1, 2), np.int64))
+        if "_final_obs" in infos:
+            break
+        assert entries("rewarded")[0] == (gain > 0)
+        assert entries("health")[0] == pytest.approx(s.health[0] / 200, abs=1 / 42)
+        health.append(entries("health")[0])
+        rewarded.append(entries("rewarded")[0])
+        gain = rewards[0]
+    assert health[0] > health[-1] > 0
+    assert sorted(health, reverse=True) == health
+    assert 0 < sum(rewarded) < len(rewarded)
+
+
+def test_an_exit_opens():
+    envs, _, entries = made(
+        "SearingSpotlights-v0", seed=2, initial_spawns=0, num_spawns=0, **IN_VIEW, exit_visible=True, num_coins=[1]
+    )
+    found = []
+    for _ in range(40):
+        *_, infos = envs.step(spot_player(envs))
+        if "_final_obs" in infos:
+            break
+        found.append((entries("exit_open")[0], entries("coin")[0] > 0))
+    assert found[0] == (0, True)
+    assert found[-1] == (1, False)
+
+
+def test_tiles_of_the_light():
+    """Row by row: their middle is that of the bright pixels below the bar."""
+    envs, _, entries = made("SearingSpotlights-v0", seed=5, initial_spawns=1, num_spawns=0, light_dim_off_duration=0)
+    seen = 0
+    for _ in range(200):
+        envs.step(np.zeros((1, 2), np.int64))
+        light = entries("light").reshape(7, 7)
+        rows, columns = (envs.frames(ALL)[0, 6:].max(axis=-1) > 60).nonzero()
+        if len(rows) > 150:
+            middle = [(light.sum(axis) * (np.arange(7) + 0.5)).sum() / light.sum() for axis in (1, 0)]
+            assert middle == pytest.approx([(rows.mean() + 6) / 12, columns.mean() / 12], abs=0.5)
+            seen += abs(middle[0] - middle[1]) > 1
+    assert seen > 10
