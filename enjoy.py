@@ -136,7 +136,7 @@ def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode)
     y, stored = agent.memory.step(memory, x)
     if hasattr(agent.memory, "attended_rows"):  # a transformer
         episode.attention.append(attention_of(agent.memory, memory, x)[0].numpy())
-    agent.memory.store(memory, stored)
+    agent.memory.advance(memory, stored)
     logits, values, features = agent.heads(y)
     policy = agent.heads.distributions(logits)
     actions = torch.stack([branch.sample() for branch in policy], -1)

@@ -1,4 +1,4 @@
-"""PPO that remembers with a recurrent network: a GRU, an LSTM, or nothing, for comparison.
+"""PPO with a recurrent memory: GRU or LSTM, or none, for comparison.
 
     python ppo_gru.py --env-id MortarMayhem-Grid-v0
 
@@ -7,19 +7,20 @@ The rollout stores the hidden state before each step. For the update, the steps 
 sequences at the ends of episodes (and every --seq-len steps), padded with zeros to the longest sequence, and run from
 the stored hidden state of their first step: truncated back-propagation through time. The gradient flows back to the
 first step of a sequence and no further. The hidden state that a rollout begins with was computed with older weights.
-So are, from the first gradient step on, those that --seq-len cuts at; --refresh-memory computes these again, with the
-current weights, before each epoch but the first.
+From the first gradient step on, the stored states at the cuts of --seq-len are stale as well; --refresh-memory
+recomputes them with the current weights before each epoch but the first.
 
-Source: "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", called the thesis below.
-§5.2 is its section, (5.7) its equation; defaults are the "Final" column of its table 6.1, without auxiliary losses.
+Source: Marco Pleines, "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", dissertation,
+called the thesis below: §5.2 is a section of it, (5.7) an equation. Defaults are the "Final" column of its table 6.1,
+without auxiliary losses.
 
-How to read: from top to bottom. Section 2 is the training loop, then its parts in the order in which it calls them;
-section 4 is the memory. What any training needs, whatever its algorithm is, comes from ppo_utils/: types of flags,
+How to read: section 2 is the training loop and what it calls, from the top down; 3 to 5 are what these are built from,
+4 the memory; 6 makes everything. Code that does not depend on the algorithm comes from ppo_utils/: types of flags,
 environments, evaluation, run folder, checkpoints, several processes, and faster ways to compute the same.
 
-Shape letters: T steps of a rollout, N environments, A action branches, B samples of a minibatch, S sequences of a
-minibatch, L steps of the longest, I inputs and D width of the memory, P hidden vectors per environment, F features, G
-entries of the ground truth, V entries of a vector.
+Shape letters: T steps of a rollout, N environments, A action branches, B steps of a minibatch, S sequences in it, L
+steps of its longest sequence, I inputs and D width of the memory, P hidden vectors of an environment, F features of the
+trunk, G entries of the ground truth.
 """
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ from torch.distributions import Categorical
 from torch.nn.utils.rnn import pad_sequence
 
 from ppo_utils.checkpoints import make_agent
-from ppo_utils.environments import as_tensors, final_numbers, final_observations, ground_truth_of
+from ppo_utils.environments import as_tensors, final_numbers, final_observations, ground_truth_of, training_envs
 from ppo_utils.fast import encode, first_occurrences, in_chunks, packed_gru
 from ppo_utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, UnitInterval, bounded
 from ppo_utils.processes import all_gather, average_gradients
-from ppo_utils.runs import Run, command, open_run, prepare, report, report_out_of_memory, run_to_end, training_envs
+from ppo_utils.runs import Run, command, end_iteration, open_run, prepare, report_out_of_memory, run_to_end
 
 
 # ---- 1 ARGS ----
@@ -56,16 +57,15 @@ class Args:
     exp_name: str = Path(__file__).stem
     """name of the experiment, part of the run folder's name"""
     preset: Literal["thesis", "laptop", "quickstart"] = "thesis"
-    """defaults to begin with, listed above; flags that are given win over them"""
+    """a set of defaults, listed above; explicit flags override it"""
     seed: NonNegativeInt = 1
-    """seed of weights, actions and environments: the same seed gives the same curves (on a CPU bit for bit, with the
-    same number of threads)"""
+    """seed of weights, actions and environments; on a CPU with as many threads, a run is repeated bit for bit"""
     torch_deterministic: bool = True
     """ask cuDNN for deterministic algorithms"""
     cuda: bool = True
     """train on the GPU if there is one"""
     amp: bool = False
-    """compute encoder, transformer and decoder in bfloat16"""
+    """compute in bfloat16, apart from recurrent layers, heads and losses"""
     track: bool = False
     """log to Weights and Biases too (extra `track`); WANDB_PROJECT and WANDB_ENTITY name project and team"""
     capture_video: bool = False
@@ -73,10 +73,9 @@ class Args:
     save_model: bool = False
     """write model.pt to the run folder when training ends"""
     load_model: str | None = None
-    """start from the weights in this file: a model.pt or a checkpoint"""
+    """start from the weights in this model.pt or checkpoint; optimizer and step count start afresh"""
     resume: str | None = None
-    """go on with the run in this folder from its last checkpoint; of all flags only --total-timesteps may change, to a
-    larger value"""
+    """continue the run in this folder from its last checkpoint; only --total-timesteps may change, to a larger value"""
     checkpoint_interval: NonNegativeInt = 50
     """iterations between checkpoints, with another one at the end (0: no checkpoints); the last two are kept"""
 
@@ -91,7 +90,7 @@ class Args:
     obs_type: Literal["pixels", "vector"] = "pixels"
     """what a Memory Gym environment shows: images, or vectors of what can be seen on them"""
     frame_stack: NonNegativeInt = 0
-    """observe the last K images, in grayscale, or the last K vectors (0: only the current one)"""
+    """observe the last K images, in grayscale, or the last K vectors (0: the current one, in color)"""
     step_encoding: bool = False
     """also observe a sinusoidal encoding of the episode's step"""
     observe_last_action: bool = False
@@ -116,7 +115,7 @@ class Args:
     gae_lambda: UnitInterval = 0.95
     """lambda of generalized advantage estimation"""
     refresh_memory: bool = False
-    """recompute the memory that a rollout stored with the current weights, before each epoch but the first"""
+    """before every epoch but the first, recompute the stored hidden states with the current weights"""
     bootstrap_truncated: bool = False
     """add the value of the final observation where a time limit ended an episode; without, it counts as terminated"""
     norm_adv: Literal["none", "minibatch", "batch"] = "none"
@@ -130,49 +129,49 @@ class Args:
     max_grad_norm: PositiveFloat = 0.25
     """largest norm of the gradient, which is scaled down to it"""
     target_kl: PositiveFloat | None = None
-    """end the update before the first minibatch whose KL divergence from the policy that acted is larger"""
+    """stop the update at a minibatch on which the approximate KL divergence from the old policy is larger"""
     init_lr: UnitInterval = 2.75e-4
-    """learning rate at first"""
+    """initial learning rate"""
     final_lr: UnitInterval = 1.0e-5
     """learning rate from --anneal-steps on"""
     exploration_bonus: Literal["entropy", "log-barrier"] = "entropy"
     """what keeps the policy exploring: its entropy, or the mean log-probability of all actions"""
     init_ent_coef: NonNegativeFloat = 1.0e-4
-    """weight of the exploration bonus at first"""
+    """initial weight of the exploration bonus"""
     final_ent_coef: NonNegativeFloat = 1.0e-6
     """weight of the exploration bonus from --anneal-steps on"""
     anneal_steps: NonNegativeInt = 163_840_000
-    """steps over which learning rate and exploration bonus decay linearly (0: they stay as at first)"""
+    """steps of linear decay, of both; does not follow --total-timesteps (0: both stay at their initial values)"""
     reconstruction_coef: NonNegativeFloat = 0.0
     """weight of the loss of reconstructing the observed image (0: off; thesis: 0.1)"""
     reconstruction_detach: bool = False
-    """train the decoder alone: no gradient of this loss reaches the agent"""
+    """only the decoder learns from this loss"""
     ground_truth_coef: NonNegativeFloat = 0.0
     """weight of the loss of estimating the environment's ground truth (0: off; thesis: 0.1)"""
     ground_truth_detach: bool = False
-    """train the estimator alone: no gradient of this loss reaches the agent"""
+    """only the estimator learns from this loss"""
     embedding: bool = True
-    """embed the encoded observation in the memory's width"""
+    """a linear layer and a ReLU between encoder and memory"""
     trunk_size: PositiveInt = 512
     """width of the layer after the memory, and of the hidden layers of policy and value"""
     value_init_gain: NonNegativeFloat = 1.0
-    """gain of the value's last layer at initialization: the smaller, the nearer to 0 are fresh values"""
+    """gain of the orthogonal initialization of the value's last layer; smaller: initial values closer to 0"""
 
     eval_interval: NonNegativeInt = 0
     """iterations between evaluations on unseen levels, with another one at the end (0: no evaluations)"""
     eval_levels: PositiveInt = 50
-    """levels of an evaluation, from start_level + num_levels on; each is played three times"""
+    """levels of an evaluation, the first that training does not use; each is played three times"""
     eval_max_steps: PositiveInt = 10_000
-    """steps after which an evaluation cuts an episode short"""
+    """an evaluation cuts episodes off after this many steps"""
 
     memory: Literal["gru", "lstm", "none"] = "gru"
     """what the agent remembers with"""
     hidden_size: PositiveInt = 512
-    """width of the hidden state"""
+    """width of the hidden state, and of the embedding"""
     num_layers: PositiveInt = 1
     """stacked recurrent layers"""
     seq_len: NonNegativeInt = 0
-    """longest sequence that the gradient flows through (0: up to the whole rollout)"""
+    """cut episodes into sequences of at most this many steps (0: only where an episode or the rollout ends)"""
 
 
 LAPTOP = {
@@ -210,16 +209,17 @@ PRESETS = {"thesis": {}, "laptop": LAPTOP, "quickstart": QUICKSTART}  # thesis: 
 def train(args: Args, run: Run) -> None:
     """Train until --total-timesteps, rounded down to whole iterations, or until a signal.
 
-    Raises FloatingPointError if the training diverges, RunError as `report` does.
+    Raises FloatingPointError if the training diverges, RunError as `end_iteration` does.
     """
     agent, rollout = run.agent, run.rollout
-    batch_size = args.num_envs * args.num_steps
-    for step in range(run.step, args.total_timesteps - batch_size + 1, batch_size):
+    batch_size = args.num_envs * args.num_steps  # of all processes together
+    # run.step is 0, or where the checkpoint of --resume was written.
+    for global_step in range(run.step, args.total_timesteps - batch_size + 1, batch_size):
         began = time.perf_counter()
-        run.iteration = step // batch_size + 1
-        lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
-        ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
-        run.optimizer.param_groups[0]["lr"].fill_(lr)
+        run.iteration = global_step // batch_size + 1
+        lr = anneal(global_step, args.init_lr, args.final_lr, args.anneal_steps)
+        ent_coef = anneal(global_step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
+        run.optimizer.param_groups[0]["lr"] = lr
 
         last_value, episodes = collect(agent, run.envs, rollout, args)
         collected = time.perf_counter()
@@ -231,15 +231,15 @@ def train(args: Args, run: Run) -> None:
         logs |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
         seconds = {"collect": collected - began, "update": updated - collected, "iteration": updated - began}
         logs |= {f"charts/seconds_{part}": value for part, value in seconds.items()}
-        run.step = step + batch_size
-        report(args, run, logs, episodes)  # evaluation, TensorBoard, progress bar, checkpoint
+        run.step = global_step + batch_size
+        end_iteration(args, run, logs, episodes)  # evaluation, TensorBoard, progress bar, checkpoint
         if run.stop:
             break
 
 
 @dataclass
 class Rollout:
-    """T steps of N environments to learn from, and what the next rollout goes on with. Each one overwrites the last."""
+    """T steps of N environments, and what the next rollout goes on with, which overwrites them."""
 
     obs: dict[str, Tensor]  # each (T, N, ...): uint8 pixels stay uint8
     actions: Tensor  # (T, N, A)
@@ -252,11 +252,16 @@ class Rollout:
     ground_truth: Tensor | None  # (T, N, G), if it is estimated
     next_obs: dict[str, np.ndarray]  # each (N, ...)
     next_ground_truth: np.ndarray | None  # (N, G)
-    memory: MemoryState
-    carry: dict[str, Tensor]  # the memory that the rollout began with
+    memory_state: MemoryState
+    initial_memory: dict[str, Tensor]  # what the rollout began with, for --refresh-memory
     advantages: Tensor | None = None  # (T, N)
     returns: Tensor | None = None  # (T, N)
-    first_occurrence: Tensor | None = None  # (T * N,) flat index of the first equal observation, if that is used
+    first_occurrence: Tensor | None = None  # (T * N,) flat index of the first equal observation; see `encode`
+
+    @property
+    def done(self) -> Tensor:
+        """(T, N) the step ended its episode, in one way or the other."""
+        return self.terminated | self.truncated
 
     @classmethod
     def allocate(cls, num_steps: int, obs: dict[str, np.ndarray], truth: np.ndarray | None, agent: Agent) -> Rollout:
@@ -268,7 +273,7 @@ class Rollout:
             return torch.zeros(num_steps, num_envs, *shape, dtype=dtype, device=device)
 
         branches = len(agent.heads.nvec)
-        memory = agent.memory.initial_state(num_envs, num_steps, device)
+        state = agent.memory.initial_state(num_envs, num_steps, device)
         return cls(
             obs={name: zeros(*part.shape[1:], dtype=part.dtype) for name, part in as_tensors(obs, device).items()},
             actions=zeros(branches, dtype=torch.int64),
@@ -281,8 +286,8 @@ class Rollout:
             ground_truth=None if truth is None else zeros(truth.shape[1]),
             next_obs=obs,
             next_ground_truth=truth,
-            memory=memory,
-            carry=agent.memory.carry(memory),
+            memory_state=state,
+            initial_memory=agent.memory.carry(state),
         )
 
 
@@ -290,24 +295,24 @@ class Rollout:
 def collect(
     agent: Agent, envs: gym.vector.VectorEnv, rollout: Rollout, args: Args
 ) -> tuple[Tensor, dict[str, list[float]]]:
-    """Act for T steps in all environments; return the value (N,) of what follows, and metrics of the ended episodes.
+    """Act for T steps in all environments; return the value (N,) of the next step, and metrics of the ended episodes.
 
     An ended episode is reset in the same step, so that next_obs begins the next one. Metrics are lists by name:
     charts/episodic_return, charts/episodic_length, and episode/* for every number in the environment's final info.
     """
-    device, memory = rollout.values.device, rollout.memory
+    device, state = rollout.values.device, rollout.memory_state
     episodes = defaultdict(list)
     rollout.truncation_values.zero_()
-    rollout.carry = agent.memory.carry(memory)
+    rollout.initial_memory = agent.memory.carry(state)
     with torch.autocast(device.type, torch.bfloat16, enabled=args.amp):
-        agent.memory.begin_rollout(memory, rollout.carry)
+        agent.memory.begin_rollout(state, rollout.initial_memory)
         for t in range(args.num_steps):
             for name, part in rollout.next_obs.items():
-                rollout.obs[name][t] = torch.from_numpy(part)  # to the device, dtype kept
+                rollout.obs[name][t] = torch.from_numpy(part)
             if rollout.ground_truth is not None:
                 rollout.ground_truth[t] = torch.as_tensor(rollout.next_ground_truth)
             obs = {name: part[t] for name, part in rollout.obs.items()}
-            rollout.actions[t], rollout.log_probs[t], rollout.values[t] = agent.get_action_and_value(obs, memory)
+            rollout.actions[t], rollout.log_probs[t], rollout.values[t] = agent.get_action_and_value(obs, state)
 
             next_obs, rewards, terminated, truncated, infos = envs.step(rollout.actions[t].cpu().numpy())
             done = terminated | truncated
@@ -315,16 +320,16 @@ def collect(
             rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
             if args.bootstrap_truncated and truncated.any():
                 final = as_tensors(final_observations(next_obs, infos, truncated), device)
-                value = agent.get_value(final, memory)  # with the memory of the episode that ended
-                rollout.truncation_values[t] = value * rollout.truncated[t]
-            agent.memory.reset(memory, torch.as_tensor(done))
+                value = agent.get_value(final, state)  # with the memory of the episode that ended
+                rollout.truncation_values[t] = value.where(rollout.truncated[t] & ~rollout.terminated[t], 0.0)
+            agent.memory.reset(state, torch.as_tensor(done))
             rollout.next_obs, rollout.next_ground_truth = next_obs, ground_truth_of(infos, args)
             if done.any():
                 episodes["charts/episodic_return"] += infos["episode"]["r"][done].tolist()
                 episodes["charts/episodic_length"] += infos["episode"]["l"][done].tolist()
                 for name, _, values in final_numbers(infos, done):
                     episodes[f"episode/{name}"] += values.tolist()
-        return agent.get_value(as_tensors(rollout.next_obs, device), memory), episodes
+        return agent.get_value(as_tensors(rollout.next_obs, device), state), episodes
 
 
 def update(
@@ -333,25 +338,25 @@ def update(
     """Learn from the rollout for some epochs; return what to log of each gradient step."""
     if args.norm_adv == "batch":
         rollout.advantages = normalize(rollout.advantages)
-    rollout.first_occurrence = first_occurrences(rollout.obs)  # on a CPU, equal images are encoded once
-    pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
-    steps = []
+    rollout.first_occurrence = first_occurrences(rollout.obs)  # for speed: on a CPU, equal images are encoded once
+    pieces = agent.memory.cut(rollout.done.cpu())
+    step_logs = []
     for epoch in range(args.update_epochs):
         if args.refresh_memory and epoch > 0:
             refresh_memory(agent, rollout, args)
         for minibatch in pieces.minibatches(args.num_minibatches):
             loss, logs = ppo_loss(agent, rollout, minibatch, ent_coef, args)
-            if args.target_kl is not None and steps:  # before the first step, the policy is still the one that acted
-                kl = np.mean(all_gather(logs["approx_kl"].item()))  # of all processes, which stop together
+            if args.target_kl is not None and step_logs:  # the first minibatch's is 0: nothing has been learned yet
+                kl = np.mean(all_gather(logs["approx_kl"].item()))  # all processes stop together
                 if kl > args.target_kl:
-                    return steps
+                    return step_logs
             optimizer.zero_grad()
             loss.backward()
             average_gradients(agent, int(minibatch.length.sum()))  # over processes, if there are several
             logs["grad_norm"] = clip_gradients(agent, args)
             optimizer.step()
-            steps.append(logs)
-    return steps
+            step_logs.append(logs)
+    return step_logs
 
 
 def ppo_loss(
@@ -367,21 +372,23 @@ def ppo_loss(
     with autocast:
         x = encode(agent.encoder, rollout.obs, index, rollout.first_occurrence)  # (B, I)
         actions = gather(rollout.actions)  # (B, A)
-        policy, log_probs, values, features = agent.evaluate_actions(x, actions, minibatch, rollout.memory)
+        policy, log_probs, values, features = agent.evaluate_actions(x, actions, minibatch, rollout.memory_state)
     log_ratio = log_probs - gather(rollout.log_probs)  # (B, A)
     advantages, old_values, returns = gather(rollout.advantages), gather(rollout.values), gather(rollout.returns)
     if args.norm_adv == "minibatch":
         advantages = normalize(advantages)
     pg_loss = policy_loss(log_ratio, advantages, args.clip_coef)
     v_loss = value_loss(values, old_values, returns, args.clip_coef if args.clip_vloss else None)
-    entropy = sum(branch.entropy() for branch in policy).mean()  # of independent branches: the sum
+    entropy = sum(branch.entropy() for branch in policy).mean()  # the branches are independent
     barrier = log_barrier(policy)
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * (entropy if args.exploration_bonus == "entropy" else barrier)
     logs = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, "log_barrier": barrier}
     if agent.decoder is not None:  # (5.5)
         with autocast:
             logits = in_chunks(agent.decoder, features.detach() if args.reconstruction_detach else features)
-        logs["reconstruction_loss"] = reconstruction_loss(logits.float(), gather(rollout.obs[agent.encoder.images[0]]))
+        pixels = gather(rollout.obs[agent.encoder.images[0]])  # (B, height, width, channels)
+        target = pixels / 255 if pixels.dtype == torch.uint8 else pixels
+        logs["reconstruction_loss"] = F.binary_cross_entropy_with_logits(logits.float(), target)
         loss = loss + args.reconstruction_coef * logs["reconstruction_loss"]
     if agent.estimator is not None:  # (5.6)
         estimate = agent.estimator(features.detach() if args.ground_truth_detach else features)  # (B, G)
@@ -393,45 +400,45 @@ def ppo_loss(
 
 @torch.no_grad()
 def refresh_memory(agent: Agent, rollout: Rollout, args: Args) -> None:
-    """Store again, with the current weights, what the rollout stored of the memory (§7.1.4; Kapturowski et al., 2019).
+    """Recompute what the rollout stored of the memory, with the current weights (§7.1.4; Kapturowski et al., 2019).
 
-    The memory that the rollout began with stays as it is. With the weights that acted, nothing changes.
+    What it began with is not recomputed. With the weights that acted, nothing changes, up to rounding.
     """
-    done, memory = (rollout.terminated | rollout.truncated).cpu(), rollout.memory
+    state, done = rollout.memory_state, rollout.done.cpu()
     with torch.autocast(rollout.values.device.type, torch.bfloat16, enabled=args.amp):
-        agent.memory.begin_rollout(memory, rollout.carry)
+        agent.memory.begin_rollout(state, rollout.initial_memory)
         for t in range(len(done)):
             x = agent.encoder({name: part[t] for name, part in rollout.obs.items()})
-            _, stored = agent.memory.step(memory, x)
-            agent.memory.store(memory, stored)
-            agent.memory.reset(memory, done[t])
+            _, hidden = agent.memory.step(state, x)
+            agent.memory.advance(state, hidden)
+            agent.memory.reset(state, done[t])
 
 
 def clip_gradients(agent: Agent, args: Args) -> Tensor:
-    """Scale the gradient down to --max-grad-norm if its norm is larger; return the norm.
+    """Scale the gradient down to --max-grad-norm if its norm is larger; return the norm before.
 
-    A detached head is clipped by itself: a share in the agent's norm would change the agent's step.
+    A detached network is clipped by itself, so that it does not change the agent's step.
     """
     own = {*agent.parameters()}
-    for head, detached in ((agent.decoder, args.reconstruction_detach), (agent.estimator, args.ground_truth_detach)):
-        if head is not None and detached:
-            nn.utils.clip_grad_norm_(head.parameters(), args.max_grad_norm)
-            own -= {*head.parameters()}
+    for network, detached in ((agent.decoder, args.reconstruction_detach), (agent.estimator, args.ground_truth_detach)):
+        if network is not None and detached:
+            nn.utils.clip_grad_norm_(network.parameters(), args.max_grad_norm)
+            own -= {*network.parameters()}
     return nn.utils.clip_grad_norm_([each for each in agent.parameters() if each in own], args.max_grad_norm)
 
 
-def mean_logs(steps: list[dict[str, Tensor]], rollout: Rollout) -> dict[str, float]:
+def mean_logs(step_logs: list[dict[str, Tensor]], rollout: Rollout) -> dict[str, float]:
     """Return the means of what the gradient steps of an update logged.
 
-    Raises FloatingPointError if a loss or a gradient was not finite, which has spoilt the weights.
+    Raises FloatingPointError if a loss or a gradient was not finite: the weights are unusable then.
     """
-    losses = {name: torch.stack([logs[name] for logs in steps]).mean().item() for name in steps[0]}
+    losses = {name: torch.stack([logs[name] for logs in step_logs]).mean().item() for name in step_logs[0]}
     if not (math.isfinite(losses["loss"]) and math.isfinite(losses["grad_norm"])):
         raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
-    # Before the first gradient step the weights are those that acted, so every ratio has to be 1.
-    losses["ratio_error"] = steps[0]["ratio_error"].item()
+    # Before the first gradient step, ratios differ from 1 by rounding only, if the update recomputes what acted.
+    losses["ratio_error"] = step_logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
-    return {f"losses/{name}": value for name, value in losses.items()} | {"charts/gradient_steps": len(steps)}
+    return {f"losses/{name}": value for name, value in losses.items()} | {"charts/gradient_steps": len(step_logs)}
 
 
 # ---- 3 PPO ----
@@ -444,14 +451,13 @@ def anneal(step: int, initial: float, final: float, anneal_steps: int) -> float:
 def gae(rollout: Rollout, last_value: Tensor, gamma: float, gae_lambda: float) -> Tensor:
     """Return the advantages (T, N) of generalized advantage estimation (2.34), cut wherever an episode ends.
 
-    last_value (N,) is the value of the observation after the last step. Where an episode is truncated, what follows is
-    worth its truncation value, which is zero unless the final observation is bootstrapped; where it terminated, zero.
+    last_value (N,) is the value of the observation after the last step. Where an episode ended, the next value is the
+    bootstrapped value of its final observation, or zero.
     """
-    done = rollout.terminated | rollout.truncated
     next_values = torch.cat([rollout.values[1:], last_value[None]])  # (T, N)
-    next_values = torch.where(done, rollout.truncation_values * ~rollout.terminated, next_values)
+    next_values = torch.where(rollout.done, rollout.truncation_values, next_values)
     deltas = rollout.rewards + gamma * next_values - rollout.values
-    decay = gamma * gae_lambda * ~done
+    decay = gamma * gae_lambda * ~rollout.done
     advantages = torch.empty_like(deltas)
     advantage = torch.zeros_like(last_value)
     for t in reversed(range(len(deltas))):
@@ -473,10 +479,7 @@ def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tens
 
 
 def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: float | None) -> Tensor:
-    """Return the mean squared error of values (B,), clipped around old_values (2.43) unless clip_coef is None.
-
-    There is no factor 1/2, which CleanRL has.
-    """
+    """Return the mean squared error of values (B,), clipped around old_values (2.43) if clip_coef; not halved."""
     loss = (values - returns).square()
     if clip_coef is not None:
         clipped = old_values + (values - old_values).clamp(-clip_coef, clip_coef)
@@ -485,17 +488,12 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: f
 
 
 def log_barrier(policy: list[Categorical]) -> Tensor:
-    """Return the mean log-probability of all actions, not only of those taken: over samples, summed over branches.
+    """Return the mean log-probability over all actions of a branch and over samples, summed over branches.
 
     It is largest for a uniform policy. Near probability 0 the gradients of surrogate loss and entropy vanish, but that
     of the log barrier does not (Agarwal et al., On the Theory of Policy Gradient Methods, 2021).
     """
     return sum(branch.logits.mean() for branch in policy)  # a Categorical's logits are normalized
-
-
-def reconstruction_loss(logits: Tensor, pixels: Tensor) -> Tensor:
-    """Return the mean binary cross-entropy (5.5) of logits and pixels, (B, height, width, channels) each."""
-    return F.binary_cross_entropy_with_logits(logits, pixels / 255 if pixels.dtype == torch.uint8 else pixels)
 
 
 @torch.no_grad()
@@ -519,7 +517,7 @@ def explained_variance(values: Tensor, returns: Tensor) -> float:
 
 @dataclass
 class Pieces:
-    """Runs of consecutive steps of one environment each, which minibatches are made of.
+    """Pieces of a rollout: consecutive steps of one environment each. A minibatch consists of whole pieces.
 
     A memory decides where a rollout is cut: a recurrent one into sequences, at the ends of episodes; a transformer into
     segments of the same length. A rollout's tensors are (T, N, ...); flattened, step t of environment n has the index
@@ -530,8 +528,8 @@ class Pieces:
         environment 1      1  3  5  7  9        6  8             6       2
                                                 1  3  5  7  9    1       5
 
-    flat_index() lists the steps of all pieces, (B,): 0 2 4 6 8 1 3 5 7 9. What belongs to them, x (B, D), is padded
-    for a network that runs over time, pad(x) (S, L, D), and unpad takes the padding away again:
+    flat_index() lists the steps of all pieces, (B,): 0 2 4 6 8 1 3 5 7 9. What belongs to them, x (B, ...), is padded
+    for a network that runs over time, pad(x) (S, L, ...), and unpad takes the padding away again:
 
         x0  x2  x4  0   0
         x6  x8  0   0   0
@@ -544,7 +542,7 @@ class Pieces:
 
     @classmethod
     def from_starts(cls, starts: Tensor) -> Pieces:
-        """Make pieces that begin at every step where starts (T, N) is true, as it is at t = 0."""
+        """Make pieces that begin at every step where starts (T, N) is true; starts[0] has to be."""
         num_steps, num_envs = starts.shape
         cuts = starts.T.flatten().nonzero()[:, 0]  # environment after environment: n * T + t
         length = torch.diff(cuts, append=torch.tensor([num_steps * num_envs]))
@@ -555,46 +553,47 @@ class Pieces:
         """Return the column indices 0 .. L - 1 of a padded batch."""
         return torch.arange(int(self.length.max()))
 
-    def is_step(self) -> Tensor:
+    def is_real(self) -> Tensor:
         """Return the mask (S, L) of a padded batch: true at steps, false at padding."""
         return self.columns() < self.length[:, None]
 
     def flat_index(self) -> Tensor:
         """Return the flat indices (B,) of all steps, piece after piece."""
-        return (self.first[:, None] + self.columns() * self.num_envs)[self.is_step()]
+        return (self.first[:, None] + self.columns() * self.num_envs)[self.is_real()]
 
     def pad(self, x: Tensor) -> Tensor:
-        """Pad what belongs to the steps, (B, D), with zeros to the longest piece: (S, L, D)."""
+        """Pad what belongs to the steps, (B, ...), with zeros to the longest piece: (S, L, ...)."""
         return pad_sequence(x.split(self.length.tolist()), batch_first=True)
 
     def unpad(self, y: Tensor) -> Tensor:
         """Take the padding away: (S, L, ...) to (B, ...)."""
-        steps = self.is_step().flatten().nonzero()[:, 0]  # found on the CPU: a mask would make a GPU wait
-        return y.flatten(0, 1).index_select(0, steps.to(y.device))
+        index = self.is_real().flatten().nonzero()[:, 0]  # on the CPU: indexing by a mask makes a GPU synchronize
+        return y.flatten(0, 1).index_select(0, index.to(y.device))
 
     def minibatches(self, count: int) -> Iterator[Pieces]:
-        """Shuffle the pieces, and distribute them, whole, over count minibatches of about the same number of steps.
+        """Shuffle the pieces, and distribute them over count minibatches of about the same number of steps.
 
-        No minibatch is empty: `check_minibatches` makes sure that no piece is longer than a minibatch's share.
+        None is empty, unless a piece is longer than 1 / count of all steps, which `prepare` has ruled out.
         """
         order = torch.randperm(len(self.first))
         first, length = self.first[order], self.length[order]
+        # Of all pieces end to end, count equal parts: a piece goes where its middle lies, twice which is an integer.
         twice_middle = 2 * length.cumsum(0) - length
-        minibatch = twice_middle * count // (2 * length.sum())  # (S,) of each piece, by the position of its middle
-        sizes = minibatch.bincount(minlength=count).tolist()
+        part = twice_middle * count // (2 * length.sum())  # (S,), ascending
+        sizes = part.bincount(minlength=count).tolist()
         for mb_first, mb_length in zip(first.split(sizes), length.split(sizes), strict=True):
             yield Pieces(mb_first, mb_length, self.num_envs)
 
 
 # ---- 4 MEMORY ----
-# What the other sections use of any memory, and what another one has to have:
+# The interface of a memory, which the other sections use:
 #   initial_state            the state of fresh episodes, with room for what a rollout stores
 #   carry, begin_rollout     what one rollout hands to the next; begin a rollout with it
-#   step, store, reset       take a step; store what it leaves; forget the episodes that ended
-#   cut, unroll              cut a rollout into pieces; run whole pieces at once in the update
-#   width                    D, the width of what comes out
-#   input_width, longest_piece, flags    what is known before it is made
-# begin_rollout, store and reset change a state in place; all others only read it.
+#   step, advance, reset     compute a step; store it and move on; forget the episodes that ended
+#   cut, unroll              cut a rollout into pieces; compute whole pieces at once in the update
+#   width                    D, the width of its output
+#   input_width, longest_piece, flags    known from the arguments alone; flags have to be those of loaded weights
+# begin_rollout, advance and reset change a state in place; all others only read it.
 @dataclass
 class MemoryState:
     """What N environments remember, and what the update needs of the rollout's steps."""
@@ -607,11 +606,11 @@ class MemoryState:
 class Memory(nn.Module):
     """A stack of GRU or LSTM layers, or nothing (§5.2).
 
-    The hidden state of an environment is P vectors of width D: one a layer for the GRU, two (hidden, then cell state)
-    for the LSTM, none without memory. Raises ValueError for flags that would change nothing without memory.
+    The hidden state of an environment is P vectors of width D: that of each layer, then for the LSTM the cell state of
+    each layer; none without memory. Raises ValueError for flags that would change nothing without memory.
     """
 
-    flags = ("memory", "hidden_size", "num_layers")  # with other values, the same weights are another network
+    flags = ("memory", "hidden_size", "num_layers")
 
     def __init__(self, args: Args, inputs: int):
         super().__init__()
@@ -622,8 +621,8 @@ class Memory(nn.Module):
         self.hidden_vectors = args.num_layers * {"gru": 1, "lstm": 2, "none": 0}[args.memory]
         if args.memory != "none":
             rnn = nn.GRU if args.memory == "gru" else nn.LSTM
-            # The outputs are activated already: another ReLU behind them would throw half of them away (§5.2.4).
-            # As in CleanRL, a matrix is orthogonal that stacks those of all gates; a single gate's is not.
+            # As in CleanRL, the stacked matrix of all gates is orthogonal, not each gate's. No ReLU follows: it would
+            # throw away half of tanh's outputs (§5.2.4).
             self.rnn = layer_init(rnn(inputs, self.width, args.num_layers, batch_first=True), 1.0)
 
     @staticmethod
@@ -633,7 +632,7 @@ class Memory(nn.Module):
 
     @staticmethod
     def longest_piece(args: Args) -> int:
-        """Return how many steps a piece of a rollout may have."""
+        """Return the most steps that a piece of a rollout can have."""
         return 1 if args.memory == "none" else min(args.seq_len or args.num_steps, args.num_steps)
 
     def initial_state(self, num_envs: int, num_steps: int, device: torch.device) -> MemoryState:
@@ -642,7 +641,7 @@ class Memory(nn.Module):
         return MemoryState(0, hidden, torch.zeros(num_steps, *hidden.shape, device=device))
 
     def carry(self, state: MemoryState) -> dict[str, Tensor]:
-        """Return what the next rollout begins with: the hidden state."""
+        """Return what the next rollout begins with: the hidden state, which nothing changes in place."""
         return {"hidden": state.hidden}
 
     def begin_rollout(self, state: MemoryState, carry: dict[str, Tensor]) -> None:
@@ -650,16 +649,17 @@ class Memory(nn.Module):
         state.t, state.hidden = 0, carry["hidden"].to(state.stored.device)
 
     def step(self, state: MemoryState, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Take one step of all environments, x (N, I): return the output (N, D) and the hidden state (N, P, D)."""
+        """Compute one step of all environments, x (N, I): the output (N, D) and the next hidden state (N, P, D)."""
         if self.kind == "none":
             return x, state.hidden
         y, hidden = self.recur(x[:, None], state.hidden)
         return y[:, 0], hidden
 
-    def store(self, state: MemoryState, hidden: Tensor) -> None:
-        """Store the hidden state before the step, and go on with the one after it."""
+    def advance(self, state: MemoryState, hidden: Tensor) -> None:
+        """Store the hidden state before the step, and move on to the one after it."""
         state.stored[state.t] = state.hidden
-        state.t, state.hidden = state.t + 1, hidden
+        state.hidden = hidden
+        state.t += 1
 
     def reset(self, state: MemoryState, done: Tensor) -> None:
         """Forget the episodes that ended: done (N,), on the CPU."""
@@ -685,8 +685,7 @@ class Memory(nn.Module):
         if self.kind == "gru" and x.device.type == "cpu":
             return packed_gru(self.rnn, x, pieces.length, hidden)  # the same without padding, and faster
         y, _ = self.recur(pieces.pad(x), hidden)  # (S, L, D)
-        # The padding ends here: what follows, the losses' means (5.8) included, sees real steps only.
-        return pieces.unpad(y)
+        return pieces.unpad(y)  # from here on, the losses' means (5.8) included, there are real steps only
 
     def recur(self, x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
         """Run the recurrent layers over x (S, L, I) from the hidden state (S, P, D); return outputs and last one."""
@@ -727,7 +726,7 @@ class AtariCNN(nn.Sequential):
         """Map pixels (B, height, width, channels), uint8 or float in [0, 1], to features (B, F)."""
         scaled = pixels.float().mul_(1 / 255) if pixels.dtype == torch.uint8 else pixels
         features = super().forward(scaled.permute(0, 3, 1, 2))  # (B, channels, height, width)
-        return features.permute(0, 2, 3, 1).flatten(1)  # in the order they have in memory: no copy
+        return features.permute(0, 2, 3, 1).flatten(1)  # a view, since they are stored channels last
 
 
 class Encoder(nn.Module):
@@ -765,8 +764,8 @@ class Heads(nn.Module):
         super().__init__()
         self.nvec = nvec  # number of actions of each branch, as Gymnasium calls it
         self.trunk = layer_init(nn.Linear(width, size))
-        self.policy = head(size, sum(nvec), 0.1)
-        self.value = head(size, 1, value_gain)
+        self.policy = mlp_head(size, sum(nvec), 0.1)
+        self.value = mlp_head(size, 1, value_gain)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Map the memory's output (B, D) to the logits of all branches, values (B,) and features (B, F)."""
@@ -779,8 +778,8 @@ class Heads(nn.Module):
         return [Categorical(logits=part, validate_args=False) for part in logits.split(self.nvec, -1)]
 
 
-def head(size: int, outputs: int, gain: float) -> nn.Sequential:
-    """Make a head with a layer of its own."""
+def mlp_head(size: int, outputs: int, gain: float) -> nn.Sequential:
+    """Make a head of two layers; gain initializes the last one."""
     return nn.Sequential(
         layer_init(nn.Linear(size, size)), nn.ReLU(inplace=True), layer_init(nn.Linear(size, outputs), gain)
     )
@@ -826,36 +825,36 @@ class Agent(nn.Module):
         images = [space[name].shape for name in self.encoder.images]
         if args.reconstruction_coef and len(images) != 1:
             raise ValueError(f"--reconstruction-coef needs an observation with one image, not {len(images)}; use 0")
-        with torch.random.fork_rng([]):  # with and without these, the random numbers that follow are the same
+        with torch.random.fork_rng(devices=[]):  # they do not change the random numbers that are drawn later
             self.decoder = Decoder(args.trunk_size, images[0]) if args.reconstruction_coef else None
-            self.estimator = head(args.trunk_size, ground_truth_size, 1.0) if args.ground_truth_coef else None
+            self.estimator = mlp_head(args.trunk_size, ground_truth_size, 1.0) if args.ground_truth_coef else None
 
-    def get_action_and_value(self, obs: dict[str, Tensor], memory: MemoryState) -> tuple[Tensor, Tensor, Tensor]:
-        """Take one step of all environments, which the memory's state stores.
+    def get_action_and_value(self, obs: dict[str, Tensor], state: MemoryState) -> tuple[Tensor, Tensor, Tensor]:
+        """Act in all environments, and move the memory's state on to the next step.
 
         Returns actions (N, A), their log-probabilities (N, A) and values (N,).
         """
-        x, stored = self.memory.step(memory, self.encoder(obs))
-        self.memory.store(memory, stored)
+        x, hidden = self.memory.step(state, self.encoder(obs))
+        self.memory.advance(state, hidden)
         logits, values, _ = self.heads(x)
         policy = self.heads.distributions(logits)
         actions = torch.stack([branch.sample() for branch in policy], -1)
         return actions, log_probs_of(policy, actions), values
 
-    def get_value(self, obs: dict[str, Tensor], memory: MemoryState) -> Tensor:
+    def get_value(self, obs: dict[str, Tensor], state: MemoryState) -> Tensor:
         """Return the values (N,) of observations that are not acted on; the memory's state stays as it is."""
-        x, _ = self.memory.step(memory, self.encoder(obs))
+        x, _ = self.memory.step(state, self.encoder(obs))
         return self.heads(x)[1]
 
     def evaluate_actions(
-        self, x: Tensor, actions: Tensor, pieces: Pieces, memory: MemoryState
+        self, x: Tensor, actions: Tensor, pieces: Pieces, state: MemoryState
     ) -> tuple[list[Categorical], Tensor, Tensor, Tensor]:
         """Recompute, with gradient, what `get_action_and_value` computed at the steps of the pieces.
 
         x: the steps' encoded observations (B, I). Returns the policy, a distribution of B actions for each branch, the
         log-probabilities (B, A) of the actions (B, A), values (B,) and features (B, F).
         """
-        logits, values, features = self.heads(self.memory.unroll(memory, x, pieces))
+        logits, values, features = self.heads(self.memory.unroll(state, x, pieces))
         policy = self.heads.distributions(logits)
         return policy, log_probs_of(policy, actions), values, features
 
@@ -867,26 +866,24 @@ def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
 
 # ---- 6 MAIN ----
 def setup(args: Args) -> Run:
-    """Check the arguments and make all that a training needs; its files come last.
+    """Check the arguments and make all that a training needs, its files last, so that bad input raises before.
 
-    Bad input raises before anything is written. Raises ValueError, OSError, ImportError or gymnasium.error.Error, each
-    with one line for the user.
+    Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
     """
     script = Path(__file__).stem
-    device, checkpoint = prepare(args, script, Memory.longest_piece(args))
+    device, checkpoint = prepare(args, script, Memory.longest_piece(args))  # checkpoint: None without --resume
     with report_out_of_memory(args, device):
         envs = training_envs(args, checkpoint)
         obs, infos = envs.reset()
         agent = make_agent(Agent, envs, infos, args).to(device)
         rollout = Rollout.allocate(args.num_steps, obs, ground_truth_of(infos, args), agent)
-    # The learning rate is a tensor, thus of float32. A float, which is of float64, would be simpler, but would change
-    # rounding, and with it the curves of docs/results.md. The weight decay is torch's default.
-    optimizer = torch.optim.AdamW(agent.parameters(), lr=torch.tensor(args.init_lr), weight_decay=0.01, fused=True)
-    return open_run(args, Run(script, envs, agent, optimizer, rollout), checkpoint)
+    optimizer = torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)
+    run = Run(script=script, envs=envs, agent=agent, optimizer=optimizer, rollout=rollout)
+    return open_run(args, run, checkpoint)  # sets all of it to the checkpoint's state, if there is one
 
 
 def main(args: Args) -> Path:
-    """Train an agent as the arguments say; return the run folder. Raises what `setup` and `run_to_end` raise."""
+    """Train an agent from Python; return the run folder. Raises what `setup` and `run_to_end` raise."""
     return run_to_end(args, setup(args), train)
 
 

@@ -2,27 +2,28 @@
 
     python ppo_trxl.py --env-id MortarMayhem-Grid-v0
 
-The agent gets one observation at a time. Every step stores its hidden states: the inputs of the transformer's blocks.
-Each block of a later step attends to those of the last --trxl-memory-length steps of the episode, the window. They are
-stored without gradient, computed with the weights that acted. --trxl-memory-gradient computes those of the same segment
-again, with gradient; --refresh-memory those of the rollout, without gradient, before each epoch but the first.
+The agent gets one observation at a time. Every step stores its hidden states, the inputs of the transformer's blocks.
+Block k of a later step attends to the inputs of block k at the last --trxl-memory-length steps of the episode, its
+window. They are stored without gradient, computed with the weights that acted. With --trxl-memory-gradient, the update
+recomputes those of a segment's earlier steps, with gradient. With --refresh-memory, it recomputes those of the rollout,
+without gradient, before each epoch but the first.
 
-A window is never gathered for every query. While acting, a hidden state is projected to its key and value once, into a
-cache that is computed again after each update. For the update, an environment's rollout and the window before it form a
-timeline, which is cut into segments of --trxl-segment-length steps. The queries of a segment attend to its own steps
-and to the window before it, all projected once, under one band mask: each query attends to the earlier steps of its own
-episode within the window.
+No query gets a copy of its window. While acting, a hidden state is projected to its key and value once, into a cache,
+and the window's again at the start of each rollout. For the update, an environment's rollout and the window before it
+form a timeline, which is cut into segments of --trxl-segment-length steps. The queries of a segment attend to its own
+steps and to those before it, all projected once, under one band mask.
 
-Source: "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", called the thesis below.
-§5.3 is its section, (5.7) its equation; defaults are the "Final" column of its table 6.1, without auxiliary losses.
+Source: Marco Pleines, "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", dissertation,
+called the thesis below: §5.3 is a section of it, (5.7) an equation. Defaults are the "Final" column of its table 6.1,
+without auxiliary losses.
 
-How to read: from top to bottom. Section 2 is the training loop, then its parts in the order in which it calls them;
-section 4 is the memory. What any training needs, whatever its algorithm is, comes from ppo_utils/: types of flags,
+How to read: section 2 is the training loop and what it calls, from the top down; 3 to 5 are what these are built from,
+4 the memory; 6 makes everything. Code that does not depend on the algorithm comes from ppo_utils/: types of flags,
 environments, evaluation, run folder, checkpoints, several processes, and faster ways to compute the same.
 
-Shape letters: T steps of a rollout, N environments, A action branches, B samples of a minibatch, S segments of a
-minibatch, L steps of the longest, W window, M steps that a segment attends to, K blocks, H attention heads, I inputs
-and D width of the memory, F features, G entries of the ground truth, V entries of a vector.
+Shape letters: T steps of a rollout, N environments, A action branches, B steps of a minibatch, S segments in it, L
+steps of its longest segment, W window, M keys that are attended to, K blocks, H attention heads, D width of the memory
+and of its input I, F features of the trunk, G entries of the ground truth.
 """
 
 from __future__ import annotations
@@ -44,11 +45,11 @@ from torch.distributions import Categorical
 from torch.nn.utils.rnn import pad_sequence
 
 from ppo_utils.checkpoints import make_agent
-from ppo_utils.environments import as_tensors, final_numbers, final_observations, ground_truth_of
+from ppo_utils.environments import as_tensors, final_numbers, final_observations, ground_truth_of, training_envs
 from ppo_utils.fast import encode, first_occurrences, in_chunks
 from ppo_utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, UnitInterval, bounded
 from ppo_utils.processes import all_gather, average_gradients
-from ppo_utils.runs import Run, command, open_run, prepare, report, report_out_of_memory, run_to_end, training_envs
+from ppo_utils.runs import Run, command, end_iteration, open_run, prepare, report_out_of_memory, run_to_end
 
 
 # ---- 1 ARGS ----
@@ -59,16 +60,15 @@ class Args:
     exp_name: str = Path(__file__).stem
     """name of the experiment, part of the run folder's name"""
     preset: Literal["thesis", "laptop", "quickstart"] = "thesis"
-    """defaults to begin with, listed above; flags that are given win over them"""
+    """a set of defaults, listed above; explicit flags override it"""
     seed: NonNegativeInt = 1
-    """seed of weights, actions and environments: the same seed gives the same curves (on a CPU bit for bit, with the
-    same number of threads)"""
+    """seed of weights, actions and environments; on a CPU with as many threads, a run is repeated bit for bit"""
     torch_deterministic: bool = True
     """ask cuDNN for deterministic algorithms"""
     cuda: bool = True
     """train on the GPU if there is one"""
     amp: bool = False
-    """compute encoder, transformer and decoder in bfloat16"""
+    """compute in bfloat16, apart from recurrent layers, heads and losses"""
     track: bool = False
     """log to Weights and Biases too (extra `track`); WANDB_PROJECT and WANDB_ENTITY name project and team"""
     capture_video: bool = False
@@ -76,10 +76,9 @@ class Args:
     save_model: bool = False
     """write model.pt to the run folder when training ends"""
     load_model: str | None = None
-    """start from the weights in this file: a model.pt or a checkpoint"""
+    """start from the weights in this model.pt or checkpoint; optimizer and step count start afresh"""
     resume: str | None = None
-    """go on with the run in this folder from its last checkpoint; of all flags only --total-timesteps may change, to a
-    larger value"""
+    """continue the run in this folder from its last checkpoint; only --total-timesteps may change, to a larger value"""
     checkpoint_interval: NonNegativeInt = 50
     """iterations between checkpoints, with another one at the end (0: no checkpoints); the last two are kept"""
 
@@ -94,7 +93,7 @@ class Args:
     obs_type: Literal["pixels", "vector"] = "pixels"
     """what a Memory Gym environment shows: images, or vectors of what can be seen on them"""
     frame_stack: NonNegativeInt = 0
-    """observe the last K images, in grayscale, or the last K vectors (0: only the current one)"""
+    """observe the last K images, in grayscale, or the last K vectors (0: the current one, in color)"""
     step_encoding: bool = False
     """also observe a sinusoidal encoding of the episode's step"""
     observe_last_action: bool = False
@@ -119,7 +118,7 @@ class Args:
     gae_lambda: UnitInterval = 0.95
     """lambda of generalized advantage estimation"""
     refresh_memory: bool = False
-    """recompute the memory that a rollout stored with the current weights, before each epoch but the first"""
+    """before every epoch but the first, recompute the stored hidden states with the current weights"""
     bootstrap_truncated: bool = False
     """add the value of the final observation where a time limit ended an episode; without, it counts as terminated"""
     norm_adv: Literal["none", "minibatch", "batch"] = "none"
@@ -133,40 +132,40 @@ class Args:
     max_grad_norm: PositiveFloat = 0.25
     """largest norm of the gradient, which is scaled down to it"""
     target_kl: PositiveFloat | None = None
-    """end the update before the first minibatch whose KL divergence from the policy that acted is larger"""
+    """stop the update at a minibatch on which the approximate KL divergence from the old policy is larger"""
     init_lr: UnitInterval = 2.75e-4
-    """learning rate at first"""
+    """initial learning rate"""
     final_lr: UnitInterval = 1.0e-5
     """learning rate from --anneal-steps on"""
     exploration_bonus: Literal["entropy", "log-barrier"] = "entropy"
     """what keeps the policy exploring: its entropy, or the mean log-probability of all actions"""
     init_ent_coef: NonNegativeFloat = 1.0e-4
-    """weight of the exploration bonus at first"""
+    """initial weight of the exploration bonus"""
     final_ent_coef: NonNegativeFloat = 1.0e-6
     """weight of the exploration bonus from --anneal-steps on"""
     anneal_steps: NonNegativeInt = 163_840_000
-    """steps over which learning rate and exploration bonus decay linearly (0: they stay as at first)"""
+    """steps of linear decay, of both; does not follow --total-timesteps (0: both stay at their initial values)"""
     reconstruction_coef: NonNegativeFloat = 0.0
     """weight of the loss of reconstructing the observed image (0: off; thesis: 0.1)"""
     reconstruction_detach: bool = False
-    """train the decoder alone: no gradient of this loss reaches the agent"""
+    """only the decoder learns from this loss"""
     ground_truth_coef: NonNegativeFloat = 0.0
     """weight of the loss of estimating the environment's ground truth (0: off; thesis: 0.1)"""
     ground_truth_detach: bool = False
-    """train the estimator alone: no gradient of this loss reaches the agent"""
+    """only the estimator learns from this loss"""
     embedding: bool = True
-    """embed the encoded observation in the memory's width"""
+    """a linear layer and a ReLU between encoder and memory"""
     trunk_size: PositiveInt = 512
     """width of the layer after the memory, and of the hidden layers of policy and value"""
     value_init_gain: NonNegativeFloat = 1.0
-    """gain of the value's last layer at initialization: the smaller, the nearer to 0 are fresh values"""
+    """gain of the orthogonal initialization of the value's last layer; smaller: initial values closer to 0"""
 
     eval_interval: NonNegativeInt = 0
     """iterations between evaluations on unseen levels, with another one at the end (0: no evaluations)"""
     eval_levels: PositiveInt = 50
-    """levels of an evaluation, from start_level + num_levels on; each is played three times"""
+    """levels of an evaluation, the first that training does not use; each is played three times"""
     eval_max_steps: PositiveInt = 10_000
-    """steps after which an evaluation cuts an episode short"""
+    """an evaluation cuts episodes off after this many steps"""
 
     trxl_num_layers: PositiveInt = 3
     """blocks of the transformer"""
@@ -237,16 +236,17 @@ PRESETS = {"thesis": {}, "laptop": LAPTOP, "quickstart": QUICKSTART}  # thesis: 
 def train(args: Args, run: Run) -> None:
     """Train until --total-timesteps, rounded down to whole iterations, or until a signal.
 
-    Raises FloatingPointError if the training diverges, RunError as `report` does.
+    Raises FloatingPointError if the training diverges, RunError as `end_iteration` does.
     """
     agent, rollout = run.agent, run.rollout
-    batch_size = args.num_envs * args.num_steps
-    for step in range(run.step, args.total_timesteps - batch_size + 1, batch_size):
+    batch_size = args.num_envs * args.num_steps  # of all processes together
+    # run.step is 0, or where the checkpoint of --resume was written.
+    for global_step in range(run.step, args.total_timesteps - batch_size + 1, batch_size):
         began = time.perf_counter()
-        run.iteration = step // batch_size + 1
-        lr = anneal(step, args.init_lr, args.final_lr, args.anneal_steps)
-        ent_coef = anneal(step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
-        run.optimizer.param_groups[0]["lr"].fill_(lr)
+        run.iteration = global_step // batch_size + 1
+        lr = anneal(global_step, args.init_lr, args.final_lr, args.anneal_steps)
+        ent_coef = anneal(global_step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
+        run.optimizer.param_groups[0]["lr"] = lr
 
         last_value, episodes = collect(agent, run.envs, rollout, args)
         collected = time.perf_counter()
@@ -258,15 +258,15 @@ def train(args: Args, run: Run) -> None:
         logs |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
         seconds = {"collect": collected - began, "update": updated - collected, "iteration": updated - began}
         logs |= {f"charts/seconds_{part}": value for part, value in seconds.items()}
-        run.step = step + batch_size
-        report(args, run, logs, episodes)  # evaluation, TensorBoard, progress bar, checkpoint
+        run.step = global_step + batch_size
+        end_iteration(args, run, logs, episodes)  # evaluation, TensorBoard, progress bar, checkpoint
         if run.stop:
             break
 
 
 @dataclass
 class Rollout:
-    """T steps of N environments to learn from, and what the next rollout goes on with. Each one overwrites the last."""
+    """T steps of N environments, and what the next rollout goes on with, which overwrites them."""
 
     obs: dict[str, Tensor]  # each (T, N, ...): uint8 pixels stay uint8
     actions: Tensor  # (T, N, A)
@@ -279,11 +279,16 @@ class Rollout:
     ground_truth: Tensor | None  # (T, N, G), if it is estimated
     next_obs: dict[str, np.ndarray]  # each (N, ...)
     next_ground_truth: np.ndarray | None  # (N, G)
-    memory: MemoryState
-    carry: dict[str, Tensor]  # the memory that the rollout began with
+    memory_state: MemoryState
+    initial_memory: dict[str, Tensor]  # what the rollout began with, for --refresh-memory
     advantages: Tensor | None = None  # (T, N)
     returns: Tensor | None = None  # (T, N)
-    first_occurrence: Tensor | None = None  # (T * N,) flat index of the first equal observation, if that is used
+    first_occurrence: Tensor | None = None  # (T * N,) flat index of the first equal observation; see `encode`
+
+    @property
+    def done(self) -> Tensor:
+        """(T, N) the step ended its episode, in one way or the other."""
+        return self.terminated | self.truncated
 
     @classmethod
     def allocate(cls, num_steps: int, obs: dict[str, np.ndarray], truth: np.ndarray | None, agent: Agent) -> Rollout:
@@ -295,7 +300,7 @@ class Rollout:
             return torch.zeros(num_steps, num_envs, *shape, dtype=dtype, device=device)
 
         branches = len(agent.heads.nvec)
-        memory = agent.memory.initial_state(num_envs, num_steps, device)
+        state = agent.memory.initial_state(num_envs, num_steps, device)
         return cls(
             obs={name: zeros(*part.shape[1:], dtype=part.dtype) for name, part in as_tensors(obs, device).items()},
             actions=zeros(branches, dtype=torch.int64),
@@ -308,8 +313,8 @@ class Rollout:
             ground_truth=None if truth is None else zeros(truth.shape[1]),
             next_obs=obs,
             next_ground_truth=truth,
-            memory=memory,
-            carry=agent.memory.carry(memory),
+            memory_state=state,
+            initial_memory=agent.memory.carry(state),
         )
 
 
@@ -317,24 +322,24 @@ class Rollout:
 def collect(
     agent: Agent, envs: gym.vector.VectorEnv, rollout: Rollout, args: Args
 ) -> tuple[Tensor, dict[str, list[float]]]:
-    """Act for T steps in all environments; return the value (N,) of what follows, and metrics of the ended episodes.
+    """Act for T steps in all environments; return the value (N,) of the next step, and metrics of the ended episodes.
 
     An ended episode is reset in the same step, so that next_obs begins the next one. Metrics are lists by name:
     charts/episodic_return, charts/episodic_length, and episode/* for every number in the environment's final info.
     """
-    device, memory = rollout.values.device, rollout.memory
+    device, state = rollout.values.device, rollout.memory_state
     episodes = defaultdict(list)
     rollout.truncation_values.zero_()
-    rollout.carry = agent.memory.carry(memory)
+    rollout.initial_memory = agent.memory.carry(state)
     with torch.autocast(device.type, torch.bfloat16, enabled=args.amp):
-        agent.memory.begin_rollout(memory, rollout.carry)
+        agent.memory.begin_rollout(state, rollout.initial_memory)
         for t in range(args.num_steps):
             for name, part in rollout.next_obs.items():
-                rollout.obs[name][t] = torch.from_numpy(part)  # to the device, dtype kept
+                rollout.obs[name][t] = torch.from_numpy(part)
             if rollout.ground_truth is not None:
                 rollout.ground_truth[t] = torch.as_tensor(rollout.next_ground_truth)
             obs = {name: part[t] for name, part in rollout.obs.items()}
-            rollout.actions[t], rollout.log_probs[t], rollout.values[t] = agent.get_action_and_value(obs, memory)
+            rollout.actions[t], rollout.log_probs[t], rollout.values[t] = agent.get_action_and_value(obs, state)
 
             next_obs, rewards, terminated, truncated, infos = envs.step(rollout.actions[t].cpu().numpy())
             done = terminated | truncated
@@ -342,16 +347,16 @@ def collect(
             rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
             if args.bootstrap_truncated and truncated.any():
                 final = as_tensors(final_observations(next_obs, infos, truncated), device)
-                value = agent.get_value(final, memory)  # with the memory of the episode that ended
-                rollout.truncation_values[t] = value * rollout.truncated[t]
-            agent.memory.reset(memory, torch.as_tensor(done))
+                value = agent.get_value(final, state)  # with the memory of the episode that ended
+                rollout.truncation_values[t] = value.where(rollout.truncated[t] & ~rollout.terminated[t], 0.0)
+            agent.memory.reset(state, torch.as_tensor(done))
             rollout.next_obs, rollout.next_ground_truth = next_obs, ground_truth_of(infos, args)
             if done.any():
                 episodes["charts/episodic_return"] += infos["episode"]["r"][done].tolist()
                 episodes["charts/episodic_length"] += infos["episode"]["l"][done].tolist()
                 for name, _, values in final_numbers(infos, done):
                     episodes[f"episode/{name}"] += values.tolist()
-        return agent.get_value(as_tensors(rollout.next_obs, device), memory), episodes
+        return agent.get_value(as_tensors(rollout.next_obs, device), state), episodes
 
 
 def update(
@@ -360,25 +365,25 @@ def update(
     """Learn from the rollout for some epochs; return what to log of each gradient step."""
     if args.norm_adv == "batch":
         rollout.advantages = normalize(rollout.advantages)
-    rollout.first_occurrence = first_occurrences(rollout.obs)  # on a CPU, equal images are encoded once
-    pieces = agent.memory.cut((rollout.terminated | rollout.truncated).cpu())
-    steps = []
+    rollout.first_occurrence = first_occurrences(rollout.obs)  # for speed: on a CPU, equal images are encoded once
+    pieces = agent.memory.cut(rollout.done.cpu())
+    step_logs = []
     for epoch in range(args.update_epochs):
         if args.refresh_memory and epoch > 0:
             refresh_memory(agent, rollout, args)
         for minibatch in pieces.minibatches(args.num_minibatches):
             loss, logs = ppo_loss(agent, rollout, minibatch, ent_coef, args)
-            if args.target_kl is not None and steps:  # before the first step, the policy is still the one that acted
-                kl = np.mean(all_gather(logs["approx_kl"].item()))  # of all processes, which stop together
+            if args.target_kl is not None and step_logs:  # the first minibatch's is 0: nothing has been learned yet
+                kl = np.mean(all_gather(logs["approx_kl"].item()))  # all processes stop together
                 if kl > args.target_kl:
-                    return steps
+                    return step_logs
             optimizer.zero_grad()
             loss.backward()
             average_gradients(agent, int(minibatch.length.sum()))  # over processes, if there are several
             logs["grad_norm"] = clip_gradients(agent, args)
             optimizer.step()
-            steps.append(logs)
-    return steps
+            step_logs.append(logs)
+    return step_logs
 
 
 def ppo_loss(
@@ -394,21 +399,23 @@ def ppo_loss(
     with autocast:
         x = encode(agent.encoder, rollout.obs, index, rollout.first_occurrence)  # (B, I)
         actions = gather(rollout.actions)  # (B, A)
-        policy, log_probs, values, features = agent.evaluate_actions(x, actions, minibatch, rollout.memory)
+        policy, log_probs, values, features = agent.evaluate_actions(x, actions, minibatch, rollout.memory_state)
     log_ratio = log_probs - gather(rollout.log_probs)  # (B, A)
     advantages, old_values, returns = gather(rollout.advantages), gather(rollout.values), gather(rollout.returns)
     if args.norm_adv == "minibatch":
         advantages = normalize(advantages)
     pg_loss = policy_loss(log_ratio, advantages, args.clip_coef)
     v_loss = value_loss(values, old_values, returns, args.clip_coef if args.clip_vloss else None)
-    entropy = sum(branch.entropy() for branch in policy).mean()  # of independent branches: the sum
+    entropy = sum(branch.entropy() for branch in policy).mean()  # the branches are independent
     barrier = log_barrier(policy)
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * (entropy if args.exploration_bonus == "entropy" else barrier)
     logs = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, "log_barrier": barrier}
     if agent.decoder is not None:  # (5.5)
         with autocast:
             logits = in_chunks(agent.decoder, features.detach() if args.reconstruction_detach else features)
-        logs["reconstruction_loss"] = reconstruction_loss(logits.float(), gather(rollout.obs[agent.encoder.images[0]]))
+        pixels = gather(rollout.obs[agent.encoder.images[0]])  # (B, height, width, channels)
+        target = pixels / 255 if pixels.dtype == torch.uint8 else pixels
+        logs["reconstruction_loss"] = F.binary_cross_entropy_with_logits(logits.float(), target)
         loss = loss + args.reconstruction_coef * logs["reconstruction_loss"]
     if agent.estimator is not None:  # (5.6)
         estimate = agent.estimator(features.detach() if args.ground_truth_detach else features)  # (B, G)
@@ -420,45 +427,45 @@ def ppo_loss(
 
 @torch.no_grad()
 def refresh_memory(agent: Agent, rollout: Rollout, args: Args) -> None:
-    """Store again, with the current weights, what the rollout stored of the memory (§7.1.4; Kapturowski et al., 2019).
+    """Recompute what the rollout stored of the memory, with the current weights (§7.1.4; Kapturowski et al., 2019).
 
-    The memory that the rollout began with stays as it is. With the weights that acted, nothing changes.
+    What it began with is not recomputed. With the weights that acted, nothing changes, up to rounding.
     """
-    done, memory = (rollout.terminated | rollout.truncated).cpu(), rollout.memory
+    state, done = rollout.memory_state, rollout.done.cpu()
     with torch.autocast(rollout.values.device.type, torch.bfloat16, enabled=args.amp):
-        agent.memory.begin_rollout(memory, rollout.carry)
+        agent.memory.begin_rollout(state, rollout.initial_memory)
         for t in range(len(done)):
             x = agent.encoder({name: part[t] for name, part in rollout.obs.items()})
-            _, stored = agent.memory.step(memory, x)
-            agent.memory.store(memory, stored)
-            agent.memory.reset(memory, done[t])
+            _, hidden = agent.memory.step(state, x)
+            agent.memory.advance(state, hidden)
+            agent.memory.reset(state, done[t])
 
 
 def clip_gradients(agent: Agent, args: Args) -> Tensor:
-    """Scale the gradient down to --max-grad-norm if its norm is larger; return the norm.
+    """Scale the gradient down to --max-grad-norm if its norm is larger; return the norm before.
 
-    A detached head is clipped by itself: a share in the agent's norm would change the agent's step.
+    A detached network is clipped by itself, so that it does not change the agent's step.
     """
     own = {*agent.parameters()}
-    for head, detached in ((agent.decoder, args.reconstruction_detach), (agent.estimator, args.ground_truth_detach)):
-        if head is not None and detached:
-            nn.utils.clip_grad_norm_(head.parameters(), args.max_grad_norm)
-            own -= {*head.parameters()}
+    for network, detached in ((agent.decoder, args.reconstruction_detach), (agent.estimator, args.ground_truth_detach)):
+        if network is not None and detached:
+            nn.utils.clip_grad_norm_(network.parameters(), args.max_grad_norm)
+            own -= {*network.parameters()}
     return nn.utils.clip_grad_norm_([each for each in agent.parameters() if each in own], args.max_grad_norm)
 
 
-def mean_logs(steps: list[dict[str, Tensor]], rollout: Rollout) -> dict[str, float]:
+def mean_logs(step_logs: list[dict[str, Tensor]], rollout: Rollout) -> dict[str, float]:
     """Return the means of what the gradient steps of an update logged.
 
-    Raises FloatingPointError if a loss or a gradient was not finite, which has spoilt the weights.
+    Raises FloatingPointError if a loss or a gradient was not finite: the weights are unusable then.
     """
-    losses = {name: torch.stack([logs[name] for logs in steps]).mean().item() for name in steps[0]}
+    losses = {name: torch.stack([logs[name] for logs in step_logs]).mean().item() for name in step_logs[0]}
     if not (math.isfinite(losses["loss"]) and math.isfinite(losses["grad_norm"])):
         raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
-    # Before the first gradient step the weights are those that acted, so every ratio has to be 1.
-    losses["ratio_error"] = steps[0]["ratio_error"].item()
+    # Before the first gradient step, ratios differ from 1 by rounding only, if the update recomputes what acted.
+    losses["ratio_error"] = step_logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
-    return {f"losses/{name}": value for name, value in losses.items()} | {"charts/gradient_steps": len(steps)}
+    return {f"losses/{name}": value for name, value in losses.items()} | {"charts/gradient_steps": len(step_logs)}
 
 
 # ---- 3 PPO ----
@@ -471,14 +478,13 @@ def anneal(step: int, initial: float, final: float, anneal_steps: int) -> float:
 def gae(rollout: Rollout, last_value: Tensor, gamma: float, gae_lambda: float) -> Tensor:
     """Return the advantages (T, N) of generalized advantage estimation (2.34), cut wherever an episode ends.
 
-    last_value (N,) is the value of the observation after the last step. Where an episode is truncated, what follows is
-    worth its truncation value, which is zero unless the final observation is bootstrapped; where it terminated, zero.
+    last_value (N,) is the value of the observation after the last step. Where an episode ended, the next value is the
+    bootstrapped value of its final observation, or zero.
     """
-    done = rollout.terminated | rollout.truncated
     next_values = torch.cat([rollout.values[1:], last_value[None]])  # (T, N)
-    next_values = torch.where(done, rollout.truncation_values * ~rollout.terminated, next_values)
+    next_values = torch.where(rollout.done, rollout.truncation_values, next_values)
     deltas = rollout.rewards + gamma * next_values - rollout.values
-    decay = gamma * gae_lambda * ~done
+    decay = gamma * gae_lambda * ~rollout.done
     advantages = torch.empty_like(deltas)
     advantage = torch.zeros_like(last_value)
     for t in reversed(range(len(deltas))):
@@ -500,10 +506,7 @@ def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tens
 
 
 def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: float | None) -> Tensor:
-    """Return the mean squared error of values (B,), clipped around old_values (2.43) unless clip_coef is None.
-
-    There is no factor 1/2, which CleanRL has.
-    """
+    """Return the mean squared error of values (B,), clipped around old_values (2.43) if clip_coef; not halved."""
     loss = (values - returns).square()
     if clip_coef is not None:
         clipped = old_values + (values - old_values).clamp(-clip_coef, clip_coef)
@@ -512,17 +515,12 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: f
 
 
 def log_barrier(policy: list[Categorical]) -> Tensor:
-    """Return the mean log-probability of all actions, not only of those taken: over samples, summed over branches.
+    """Return the mean log-probability over all actions of a branch and over samples, summed over branches.
 
     It is largest for a uniform policy. Near probability 0 the gradients of surrogate loss and entropy vanish, but that
     of the log barrier does not (Agarwal et al., On the Theory of Policy Gradient Methods, 2021).
     """
     return sum(branch.logits.mean() for branch in policy)  # a Categorical's logits are normalized
-
-
-def reconstruction_loss(logits: Tensor, pixels: Tensor) -> Tensor:
-    """Return the mean binary cross-entropy (5.5) of logits and pixels, (B, height, width, channels) each."""
-    return F.binary_cross_entropy_with_logits(logits, pixels / 255 if pixels.dtype == torch.uint8 else pixels)
 
 
 @torch.no_grad()
@@ -546,7 +544,7 @@ def explained_variance(values: Tensor, returns: Tensor) -> float:
 
 @dataclass
 class Pieces:
-    """Runs of consecutive steps of one environment each, which minibatches are made of.
+    """Pieces of a rollout: consecutive steps of one environment each. A minibatch consists of whole pieces.
 
     A memory decides where a rollout is cut: a recurrent one into sequences, at the ends of episodes; a transformer into
     segments of the same length. A rollout's tensors are (T, N, ...); flattened, step t of environment n has the index
@@ -557,8 +555,8 @@ class Pieces:
         environment 1      1  3  5  7  9        6  8             6       2
                                                 1  3  5  7  9    1       5
 
-    flat_index() lists the steps of all pieces, (B,): 0 2 4 6 8 1 3 5 7 9. What belongs to them, x (B, D), is padded
-    for a network that runs over time, pad(x) (S, L, D), and unpad takes the padding away again:
+    flat_index() lists the steps of all pieces, (B,): 0 2 4 6 8 1 3 5 7 9. What belongs to them, x (B, ...), is padded
+    for a network that runs over time, pad(x) (S, L, ...), and unpad takes the padding away again:
 
         x0  x2  x4  0   0
         x6  x8  0   0   0
@@ -571,7 +569,7 @@ class Pieces:
 
     @classmethod
     def from_starts(cls, starts: Tensor) -> Pieces:
-        """Make pieces that begin at every step where starts (T, N) is true, as it is at t = 0."""
+        """Make pieces that begin at every step where starts (T, N) is true; starts[0] has to be."""
         num_steps, num_envs = starts.shape
         cuts = starts.T.flatten().nonzero()[:, 0]  # environment after environment: n * T + t
         length = torch.diff(cuts, append=torch.tensor([num_steps * num_envs]))
@@ -582,58 +580,59 @@ class Pieces:
         """Return the column indices 0 .. L - 1 of a padded batch."""
         return torch.arange(int(self.length.max()))
 
-    def is_step(self) -> Tensor:
+    def is_real(self) -> Tensor:
         """Return the mask (S, L) of a padded batch: true at steps, false at padding."""
         return self.columns() < self.length[:, None]
 
     def flat_index(self) -> Tensor:
         """Return the flat indices (B,) of all steps, piece after piece."""
-        return (self.first[:, None] + self.columns() * self.num_envs)[self.is_step()]
+        return (self.first[:, None] + self.columns() * self.num_envs)[self.is_real()]
 
     def pad(self, x: Tensor) -> Tensor:
-        """Pad what belongs to the steps, (B, D), with zeros to the longest piece: (S, L, D)."""
+        """Pad what belongs to the steps, (B, ...), with zeros to the longest piece: (S, L, ...)."""
         return pad_sequence(x.split(self.length.tolist()), batch_first=True)
 
     def unpad(self, y: Tensor) -> Tensor:
         """Take the padding away: (S, L, ...) to (B, ...)."""
-        steps = self.is_step().flatten().nonzero()[:, 0]  # found on the CPU: a mask would make a GPU wait
-        return y.flatten(0, 1).index_select(0, steps.to(y.device))
+        index = self.is_real().flatten().nonzero()[:, 0]  # on the CPU: indexing by a mask makes a GPU synchronize
+        return y.flatten(0, 1).index_select(0, index.to(y.device))
 
     def minibatches(self, count: int) -> Iterator[Pieces]:
-        """Shuffle the pieces, and distribute them, whole, over count minibatches of about the same number of steps.
+        """Shuffle the pieces, and distribute them over count minibatches of about the same number of steps.
 
-        No minibatch is empty: `check_minibatches` makes sure that no piece is longer than a minibatch's share.
+        None is empty, unless a piece is longer than 1 / count of all steps, which `prepare` has ruled out.
         """
         order = torch.randperm(len(self.first))
         first, length = self.first[order], self.length[order]
+        # Of all pieces end to end, count equal parts: a piece goes where its middle lies, twice which is an integer.
         twice_middle = 2 * length.cumsum(0) - length
-        minibatch = twice_middle * count // (2 * length.sum())  # (S,) of each piece, by the position of its middle
-        sizes = minibatch.bincount(minlength=count).tolist()
+        part = twice_middle * count // (2 * length.sum())  # (S,), ascending
+        sizes = part.bincount(minlength=count).tolist()
         for mb_first, mb_length in zip(first.split(sizes), length.split(sizes), strict=True):
             yield Pieces(mb_first, mb_length, self.num_envs)
 
 
 # ---- 4 MEMORY ----
-# What the other sections use of any memory, and what another one has to have:
+# The interface of a memory, which the other sections use:
 #   initial_state            the state of fresh episodes, with room for what a rollout stores
 #   carry, begin_rollout     what one rollout hands to the next; begin a rollout with it
-#   step, store, reset       take a step; store what it leaves; forget the episodes that ended
-#   cut, unroll              cut a rollout into pieces; run whole pieces at once in the update
-#   width                    D, the width of what comes out
-#   input_width, longest_piece, flags    what is known before it is made
-# begin_rollout, store and reset change a state in place; all others only read it.
+#   step, advance, reset     compute a step; store it and move on; forget the episodes that ended
+#   cut, unroll              cut a rollout into pieces; compute whole pieces at once in the update
+#   width                    D, the width of its output
+#   input_width, longest_piece, flags    known from the arguments alone; flags have to be those of loaded weights
+# begin_rollout, advance and reset change a state in place; all others only read it.
 @dataclass
 class MemoryState:
     """What N environments remember: a timeline of the W steps before a rollout and its T steps.
 
-    Row W + t of the timeline is step t of the rollout. Numbers of steps stay on the CPU: shapes depend on them, and
-    reading them from a GPU would force a synchronization.
+    Row W + t of the timeline is step t of the rollout. While that step is computed, now = W + t, and the rows before it
+    are filled. Numbers of steps stay on the CPU, since shapes depend on them.
     """
 
     now: int  # row of the step that comes next
     episode_step: Tensor  # (N,) which step of its episode that is
+    row_step: Tensor  # (W + T, N) which step of its episode each row is
     hidden: Tensor  # (W + T, N, K + 1, D) the input of every block, and the last one's output
-    stored_step: Tensor  # (W + T, N) which step of its episode each row is
     keys: Tensor  # (K, N, W + T, D) projections of the blocks' inputs, a cache for acting
     values: Tensor  # (K, N, W + T, D)
 
@@ -641,12 +640,12 @@ class MemoryState:
 class Memory(nn.Module):
     """Transformer-XL as an episodic memory with a sliding window (§5.3), or GTrXL.
 
-    Every step stores the inputs of the K blocks. A step's query in block k attends to the k-th input of up to W steps
-    before it, of the same episode, never to its own. Raises ValueError unless `inputs` is --trxl-dim, even and a
-    multiple of --trxl-num-heads, and for flags that would change nothing.
+    Every step stores the inputs of the K blocks, and the last one's output for --trxl-query-output. A step's query in
+    block k attends to the inputs of block k at up to W steps before it, of the same episode, never to its own. What no
+    query attends to is set to zero before it is read: a mask alone would let a NaN pass (0 * NaN is NaN). Raises
+    ValueError for a width that does not fit, and for flags that would change nothing.
     """
 
-    # With other values of these flags, the same weights are another network.
     flags = ("trxl_num_layers", "trxl_num_heads", "trxl_dim", "trxl_memory_length", "trxl_positional_encoding")
     flags += ("trxl_query_position", "trxl_query_output", "trxl_pe_length", "trxl_layer_norm", "trxl_gate")
 
@@ -668,8 +667,7 @@ class Memory(nn.Module):
         for block in self.blocks:
             block_init(block, args.trxl_init, args.trxl_num_layers)
         if self.encoding == "learned":
-            length = args.trxl_pe_length + 1  # one for what follows an episode's last step, which may be valued
-            self.table = nn.Parameter(torch.randn(length, self.width) / math.sqrt(self.width))
+            self.table = nn.Parameter(torch.randn(args.trxl_pe_length + 1, self.width) / math.sqrt(self.width))
         self.query_output = nn.Linear(self.width, self.width, bias=False) if args.trxl_query_output else None
 
     @staticmethod
@@ -679,126 +677,130 @@ class Memory(nn.Module):
 
     @staticmethod
     def longest_piece(args: Args) -> int:
-        """Return how many steps a piece of a rollout may have."""
+        """Return the most steps that a piece of a rollout can have."""
         return min(args.trxl_segment_length, args.num_steps)
 
     def initial_state(self, num_envs: int, num_steps: int, device: torch.device) -> MemoryState:
         """Return the state of fresh episodes, with no step to attend to and room for a rollout of num_steps."""
-        rows, blocks = self.window + num_steps, len(self.blocks)
-        cache = (blocks, num_envs, rows, self.width)
+        rows, num_blocks = self.window + num_steps, len(self.blocks)
+        cache_shape = (num_blocks, num_envs, rows, self.width)
         return MemoryState(
             now=self.window,
             episode_step=torch.zeros(num_envs, dtype=torch.int64),
-            hidden=torch.zeros(rows, num_envs, blocks + 1, self.width, device=device),
-            stored_step=torch.zeros(rows, num_envs, dtype=torch.int64),
-            keys=torch.zeros(cache, dtype=self.cache_dtype, device=device),
-            values=torch.zeros(cache, dtype=self.cache_dtype, device=device),
+            row_step=torch.zeros(rows, num_envs, dtype=torch.int64),
+            hidden=torch.zeros(rows, num_envs, num_blocks + 1, self.width, device=device),
+            keys=torch.zeros(cache_shape, dtype=self.cache_dtype, device=device),
+            values=torch.zeros(cache_shape, dtype=self.cache_dtype, device=device),
         )
 
     def carry(self, state: MemoryState) -> dict[str, Tensor]:
-        """Return what the next rollout begins with: the window before its first step."""
+        """Return what the next rollout begins with: the last W rows, and the steps of the episodes."""
         rows = slice(state.now - self.window, state.now)
-        stored = {"hidden": state.hidden[rows].clone(), "stored_step": state.stored_step[rows].clone()}
-        return stored | {"episode_step": state.episode_step}
+        parts = {"hidden": state.hidden[rows], "row_step": state.row_step[rows], "episode_step": state.episode_step}
+        return {name: part.clone() for name, part in parts.items()}
 
+    @torch.no_grad()
     def begin_rollout(self, state: MemoryState, carry: dict[str, Tensor]) -> None:
         """Go on with what `carry` returned, and project it to keys and values with the current weights."""
         state.now, state.episode_step = self.window, carry["episode_step"]
-        state.hidden[: self.window], state.stored_step[: self.window] = carry["hidden"], carry["stored_step"]
+        state.row_step[: self.window] = carry["row_step"]
+        state.hidden[: self.window] = carry["hidden"]
         rows, _, mask = self.attended_rows(state)
-        mask = mask[:, 0].T  # (M, N)
-        # What no query attends to becomes zero: a NaN in it would spread even through a weight of zero.
-        hidden = state.hidden[rows].masked_fill(~mask[..., None, None], 0.0)  # (M, N, K + 1, D)
-        position = self.position(state.stored_step[rows].to(mask.device).where(mask, 0), hidden.dtype)  # (M, N, D)
+        hidden = state.hidden[rows].masked_fill(~mask[:, 0].T[..., None, None], 0.0)  # (M, N, K + 1, D)
+        position = self.position(state.row_step[rows].to(hidden.device), hidden.dtype)  # (M, N, D)
         for k, block in enumerate(self.blocks):
             keys, values = block.keys_values(hidden[:, :, k] + position)
-            state.keys[k][:, rows], state.values[k][:, rows] = keys.transpose(0, 1), values.transpose(0, 1)
+            state.keys[k, :, rows] = keys.transpose(0, 1)  # (N, M, D)
+            state.values[k, :, rows] = values.transpose(0, 1)
 
     def step(self, state: MemoryState, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Take one step of all environments, x (N, D): return the output (N, D) and hidden states (N, K + 1, D)."""
+        """Compute one step of all environments, x (N, D): the output (N, D) and hidden states (N, K + 1, D)."""
         rows, age, mask = self.attended_rows(state)
         x = x[:, None]  # (N, 1, D)
-        episode_step = state.episode_step.to(x.device)[:, None]  # (N, 1)
+        query = self.first_query(x, state.episode_step.to(x.device)[:, None], state.hidden[state.now - 1, :, -1:])
         hidden = [x]
         for k, block in enumerate(self.blocks):
-            query = self.first_query(x, episode_step, state.hidden[state.now - 1, :, -1:]) if k == 0 else x
-            x = block(x, query, (state.keys[k][:, rows], state.values[k][:, rows]), age, mask)
+            # Behind the first block, a query is what goes through the block.
+            x = query = block(x, query, (state.keys[k][:, rows], state.values[k][:, rows]), age, mask)
             hidden.append(x)
-        return x[:, 0], torch.cat(hidden, 1)  # (N, K + 1, D)
+        return x[:, 0], torch.cat(hidden, 1)
 
-    def store(self, state: MemoryState, hidden: Tensor) -> None:
-        """Store the step's hidden states (N, K + 1, D), and cache their projections to keys and values."""
-        state.hidden[state.now], state.stored_step[state.now] = hidden.detach(), state.episode_step
+    @torch.no_grad()
+    def advance(self, state: MemoryState, hidden: Tensor) -> None:
+        """Store the step's hidden states (N, K + 1, D), cache their keys and values, and move on."""
+        state.hidden[state.now] = hidden
+        state.row_step[state.now] = state.episode_step
         position = self.position(state.episode_step.to(hidden.device), hidden.dtype)  # (N, D)
         for k, block in enumerate(self.blocks):
-            keys, values = block.keys_values(hidden[:, k] + position)  # (N, D) each
-            state.keys[k][:, state.now], state.values[k][:, state.now] = keys, values
-        state.now, state.episode_step = state.now + 1, state.episode_step + 1
+            state.keys[k][:, state.now], state.values[k][:, state.now] = block.keys_values(hidden[:, k] + position)
+        state.episode_step = state.episode_step + 1
+        state.now += 1
 
     def reset(self, state: MemoryState, done: Tensor) -> None:
         """Forget the episodes that ended: done (N,), on the CPU."""
-        rows = slice(state.now - self.window_length(state.episode_step), state.now)
+        rows, ended = self.attended_rows(state)[0], done.nonzero()[:, 0].to(state.keys.device)
         for cache in (state.keys, state.values):
-            # No query attends to these, but a NaN among them would spread even through a weight of zero.
-            cache[:, done.nonzero().to(cache.device), rows] = 0.0
+            cache[:, ended, rows] = 0.0  # (K, ended, rows, D)
         state.episode_step = state.episode_step.masked_fill(done, 0)
 
     def cut(self, done: Tensor) -> Pieces:
-        """Cut a rollout into segments. Where episodes end, done (T, N), is for `attention_mask` to see."""
+        """Cut a rollout, done (T, N), into segments. They may span episodes, which `attention_mask` keeps apart."""
         starts = torch.arange(len(done)) % self.segment_length == 0
         return Pieces.from_starts(starts[:, None].expand_as(done))
 
     def unroll(self, state: MemoryState, x: Tensor, pieces: Pieces) -> Tensor:
-        """Run whole segments: x (B, D) to (B, D), attending to the stored hidden states of up to W steps before each.
+        """Compute whole segments at once, x (B, D) to (B, D), each from the stored hidden states before and in it.
 
-        All queries of a segment share its keys, and a band mask tells which of them each one attends to. Below, a
-        segment of four steps, a window of three, and an episode that ends after the second step (1: attended to):
+        All queries of a segment share its keys: those of its own steps but the last, and of the steps before it. A band
+        mask tells which of them a query attends to. A window of three, and a second segment of four steps, rows W + 4 =
+        7 to 10 of the timeline, in which an episode ends after the second step (1: attended to):
 
-                               the W steps before   the segment's own, but for its last
-            query, step 5            1  1  1           .  .  .
-            query, step 6            .  1  1           1  .  .
-            query, step 0            .  .  .           .  .  .      an episode's first step attends to nothing
-            query, step 1            .  .  .           .  .  1
+            row                           4  5  6   7  8  9
+            key column                   -3 -2 -1   0  1  2
+            query column 0, step 5        1  1  1   .  .  .
+            query column 1, step 6        .  1  1   1  .  .
+            query column 2, step 0        .  .  .   .  .  .     an episode's first step attends to nothing
+            query column 3, step 1        .  .  .   .  .  1
 
-        With --trxl-memory-gradient, the segment's own are recomputed block inputs instead of the stored ones: the same
-        numbers as long as the weights are, but with a gradient to earlier steps (Dai et al., 2019).
+        With --trxl-memory-gradient, keys of the segment's own steps are computed from the block inputs of this pass,
+        with gradient (Dai et al., 2019): the same numbers, as long as the weights are those that acted.
         """
-        device, last_row = x.device, len(state.stored_step) - 1  # a short last segment's padding lies beyond that row
+        device, last_row = x.device, len(state.row_step) - 1  # a short segment's padding lies beyond that row
         x = pieces.pad(x)  # (S, L, D)
         first = pieces.first[:, None]  # (S, 1)
-        row, env = self.window + first // pieces.num_envs, first % pieces.num_envs  # (S, 1) of a segment's first step
+        row, env = self.window + first // pieces.num_envs, first % pieces.num_envs  # (S, 1) each, of the first steps
         columns = pieces.columns()  # (L,)
-        episode_step = state.stored_step[(row + columns).clamp(max=last_row), env].where(pieces.is_step(), 0)  # (S, L)
-        before = self.window_length(episode_step[:, 0])  # steps before the segment: later queries attend to no earlier
-        key_columns = torch.arange(-before, len(columns) - 1)  # (M,)
-        rows = (row + key_columns).clamp(max=last_row)  # (S, M)
-        stored_step = state.stored_step[rows, env].to(device)  # (S, M)
-        hidden = state.hidden[rows.to(device), env.to(device)]  # (S, M, K + 1, D)
-        age = (columns[:, None] - key_columns).to(device)  # (L, M)
-        episode_step = episode_step.to(device)
-        mask = attention_mask(age, episode_step[..., None], self.window)  # (S, L, M)
-        attended = mask.any(1)  # (S, M); what no query attends to becomes zero, so that not even a NaN has an effect
-        hidden, stored_step = hidden.masked_fill(~attended[..., None, None], 0.0), stored_step.where(attended, 0)
-        position = self.position(stored_step, x.dtype)  # (S, M, D)
-        previous_output = hidden[:, before - 1 :, -1]  # (S, L, D): columns -1 .. L - 2
+        query_rows = (row + columns).clamp(max=last_row)  # (S, L)
+        query_step = state.row_step[query_rows, env].where(pieces.is_real(), 0)  # (S, L); padding attends to nothing
+        # A query in column c is at most c steps further in that episode, and attends no further back than the first.
+        length = self.window_length(query_step[:, 0])
+        key_columns = torch.arange(-length, len(columns) - 1)  # (M,)
+        key_rows = (row + key_columns).clamp(max=last_row)  # (S, M)
+        key_step = state.row_step[key_rows, env].to(device)  # (S, M)
+        hidden = state.hidden[key_rows.to(device), env.to(device)]  # (S, M, K + 1, D)
+        age, query_step = (columns[:, None] - key_columns).to(device), query_step.to(device)  # (L, M), (S, L)
+        mask = attention_mask(age, query_step[..., None], self.window)  # (S, L, M)
+        attended = mask.any(1)[..., None]  # (S, M, 1)
+        hidden = hidden.masked_fill(~attended[..., None], 0.0)
+        position = self.position(key_step, x.dtype)  # (S, M, D)
+        query = self.first_query(x, query_step, hidden[:, length - 1 :, -1])  # column c gets the output of column c - 1
         for k, block in enumerate(self.blocks):
-            attended_to = hidden[:, :, k]  # (S, M, D)
+            inputs = hidden[:, :, k]  # (S, M, D)
             if self.memory_gradient:
-                own = x[:, :-1].masked_fill(~attended[:, before:, None], 0.0)
-                attended_to = torch.cat([attended_to[:, :before], own], 1)
-            query = self.first_query(x, episode_step, previous_output) if k == 0 else x
-            x = block(x, query, block.keys_values(attended_to + position), age, mask)
+                own = x[:, :-1].masked_fill(~attended[:, length:], 0.0)
+                inputs = torch.cat([inputs[:, :length], own], 1)
+            x = query = block(x, query, block.keys_values(inputs + position), age, mask)
         return pieces.unpad(x)
 
     def attended_rows(self, state: MemoryState) -> tuple[slice, Tensor, Tensor]:
         """Return the M rows that the next step may attend to, their ages (1, M), and the mask (N, 1, M)."""
         length = self.window_length(state.episode_step)
-        age = torch.arange(length, 0, -1)[None]  # (1, M), the oldest step first
+        age = torch.arange(length, 0, -1)[None]
         mask = attention_mask(age, state.episode_step[:, None], self.window)[:, None]
         return slice(state.now - length, state.now), age.to(state.hidden.device), mask.to(state.hidden.device)
 
     def window_length(self, episode_step: Tensor) -> int:
-        """Return how much of the window queries at these steps may use; at least 1, since attention needs a key."""
+        """Return how much of the window queries at these steps use; at least 1, since attention needs a key."""
         return min(max(int(episode_step.max()), 1), self.window)
 
     def encode_step(self, episode_step: Tensor, dtype: torch.dtype) -> Tensor:
@@ -807,11 +809,11 @@ class Memory(nn.Module):
             return self.table[episode_step.clamp(max=len(self.table) - 1)]
         return sinusoid(episode_step, self.width).to(dtype)
 
-    def position(self, stored_step: Tensor, dtype: torch.dtype) -> Tensor:
-        """Return what is added to hidden states of these steps (...): their encoding (..., D), or zeros without one."""
+    def position(self, episode_step: Tensor, dtype: torch.dtype) -> Tensor:
+        """Return what is added to hidden states of these steps (...): their encoding (..., D), or a zero."""
         if self.encoding in ("absolute", "learned"):
-            return self.encode_step(stored_step, dtype)
-        return torch.zeros(*stored_step.shape, self.width, dtype=dtype, device=stored_step.device)
+            return self.encode_step(episode_step, dtype)
+        return torch.zeros((), dtype=dtype, device=episode_step.device)
 
     def first_query(self, x: Tensor, episode_step: Tensor, previous_output: Tensor) -> Tensor:
         """Return x (S, L, D), and added to it the encoding of episode_step (S, L) and the previous output (§7.1.3)."""
@@ -822,17 +824,17 @@ class Memory(nn.Module):
 
 
 def attention_mask(age: Tensor, episode_step: Tensor, window: int) -> Tensor:
-    """Return whether a query at this step of its episode attends to the step that lies `age` steps before it.
+    """Return whether a query at this step of its episode attends to a key that is `age` steps older.
 
     The one rule of what is attended to: in the rollout, for the bootstrap value and in the update.
     """
     return (age >= 1) & (age <= episode_step) & (age <= window)
 
 
-def sinusoid(position: Tensor, width: int) -> Tensor:
-    """Encode positions, steps or ages of any shape, as sines and cosines (2.57, 2.58): (..., width) float64."""
-    frequency = 10000 ** (-torch.arange(0, width, 2, dtype=torch.float64, device=position.device) / width)
-    angle = position[..., None] * frequency
+def sinusoid(index: Tensor, width: int) -> Tensor:
+    """Encode steps or ages of any shape as sines and cosines (2.57, 2.58): (..., width) float64."""
+    frequency = 10000 ** (-torch.arange(0, width, 2, dtype=torch.float64, device=index.device) / width)
+    angle = index[..., None] * frequency
     return torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)  # (..., width / 2, 2) to (..., width)
 
 
@@ -846,21 +848,21 @@ class Block(nn.Module):
         super().__init__()
         width = args.trxl_dim
         before, after = (nn.LayerNorm, nn.Identity) if args.trxl_layer_norm == "pre" else (nn.Identity, nn.LayerNorm)
-        self.norm_query, self.norm_items, self.norm_output = before(width), before(width), before(width)
+        self.norm_query, self.norm_memory, self.norm_output = before(width), before(width), before(width)
         self.after_attention, self.after_projection = after(width), after(width)
         self.attention = Attention(width, args.trxl_num_heads, args.trxl_positional_encoding == "relative")
         self.projection = nn.Linear(width, width)
-        self.merge_attention = self.merge_output = torch.add  # residual connections
-        if args.trxl_gate == "gru":
-            self.merge_attention, self.merge_output = (Gate(width, args.trxl_gate_bias) for _ in range(2))
+        gated = args.trxl_gate == "gru"  # else, residual connections
+        self.merge_attention = Gate(width, args.trxl_gate_bias) if gated else torch.add
+        self.merge_output = Gate(width, args.trxl_gate_bias) if gated else torch.add
 
     def keys_values(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
         """Project hidden states (..., D), to which their positions are added already, to keys and values."""
-        hidden = self.norm_items(hidden)
+        hidden = self.norm_memory(hidden)
         return self.attention.key(hidden), self.attention.value(hidden)
 
     def forward(self, x: Tensor, query: Tensor, keys_values: tuple, age: Tensor, mask: Tensor) -> Tensor:
-        """Map x (S, L, D) to the next block's input (S, L, D); query (S, L, D) is x, or x and what is added to it."""
+        """Map x (S, L, D) to the next block's input (S, L, D); query (S, L, D) is x, or in the first block more."""
         x = self.merge_attention(x, self.attention(self.norm_query(query), *keys_values, age, mask))
         x = self.after_attention(x)
         x = self.merge_output(x, F.relu(self.projection(self.norm_output(x))))
@@ -868,10 +870,10 @@ class Block(nn.Module):
 
 
 class Attention(nn.Module):
-    """Multi-head attention (2.55, 2.56) to hidden states that are projected to keys and values elsewhere.
+    """Multi-head attention (2.55, 2.56) to keys and values that `Block.keys_values` made, so that they can be cached.
 
-    With relative encoding the scores are those of (2.61), as the thesis has it: unlike in Dai et al. (2019), positions
-    are projected to keys as hidden states are, and u and v as queries are.
+    With relative encoding the scores are those of (2.61), as the thesis has it: unlike in Dai et al. (2019), the matrix
+    of the keys projects positions too, and that of the queries u and v.
     """
 
     def __init__(self, width: int, num_heads: int, relative: bool):
@@ -888,7 +890,7 @@ class Attention(nn.Module):
     def forward(self, x: Tensor, keys: Tensor, values: Tensor, age: Tensor, mask: Tensor) -> Tensor:
         """Attend from x (S, L, D) to keys and values (S, M, D): exactly zero for a query with nothing to attend to.
 
-        age (L, M): how many steps lie between a query and a key. mask (S, L, M): which keys a query attends to.
+        age (L, M): how many steps older than its query a key is. mask (S, L, M): which keys a query attends to.
         """
         query, bias, empty = self.query_and_bias(x, age, mask)
         y = F.scaled_dot_product_attention(query, self.split(keys), self.split(values), bias)  # (S, H, L, D / H)
@@ -900,25 +902,25 @@ class Attention(nn.Module):
         mask = (mask | empty)[:, None]  # (S, 1, L, M); a row without any key would make the softmax NaN
         if not self.relative:
             return self.split(self.query(x)), mask, empty
-        query = self.split(self.query(x + self.content_bias))
-        # As many ages as keys: the last query and the first key are farthest apart.
+        content_query = self.split(self.query(x + self.content_bias))
+        position_query = self.split(self.query(x + self.position_bias))
+        # Score each possible age once, from 1 to M, and look up that of each key: an age of 2 is in column 1.
         ages = torch.arange(1, age.shape[1] + 1, device=x.device)
-        encoded = self.split(self.key(sinusoid(ages, x.shape[-1]).to(x.dtype))[None])  # (1, H, ages, D / H)
-        by_age = self.split(self.query(x + self.position_bias)) @ encoded.transpose(2, 3)  # (S, H, L, ages)
-        at = (age.clamp(min=1) - 1).expand(*by_age.shape[:3], -1)  # (S, H, L, M)
-        bias = by_age.gather(-1, at) / math.sqrt(query.shape[-1])
-        return query, bias.masked_fill(~mask, -math.inf), empty
+        encoded = self.split(self.key(sinusoid(ages, x.shape[-1]).to(x.dtype))[None])  # (1, H, M, D / H)
+        scores = position_query @ encoded.transpose(2, 3) / math.sqrt(encoded.shape[-1])  # (S, H, L, M)
+        column = (age.clamp(min=1) - 1).expand_as(scores)
+        return content_query, scores.gather(-1, column).masked_fill(~mask, -math.inf), empty
 
     def split(self, x: Tensor) -> Tensor:
-        """Split the width between the heads: (S, L, D) to (S, H, L, D / H)."""
+        """Split the width of (S, any length, D) between the heads: (S, H, the same length, D / H)."""
         return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
 
 
 class Gate(nn.Module):
     """A gated recurrent unit in place of a residual connection: GTrXL (Parisotto et al., 2020).
 
-    The stream x is its hidden state, and the output y of a layer its input; §2.4.7 has them the other way round, see
-    docs/memory.md. A bias above 0 mostly keeps x at first.
+    The stream x is its hidden state, and the output y of a layer its input; §2.4.7 has them the other way round, where
+    a bias would keep y. A bias above 0 mostly keeps x at first.
     """
 
     def __init__(self, width: int, bias: float):
@@ -936,10 +938,10 @@ class Gate(nn.Module):
         return torch.lerp(x, h.to(x.dtype), z.to(x.dtype))  # (1 - z) x + z h
 
 
-def block_init(block: Block, scheme: str, blocks: int) -> None:
+def block_init(block: Block, scheme: str, num_blocks: int) -> None:
     """Initialize the weights of a block's layers by the scheme (table 6.1), and their biases with zero.
 
-    T-Fixup (Huang et al., 2020) is Xavier with values, outputs and projections scaled by 0.67 / blocks^(1/4).
+    T-Fixup (Huang et al., 2020) is Xavier with values, outputs and projections scaled by 0.67 / num_blocks^(1/4).
     """
     init = {"orthogonal": nn.init.orthogonal_, "kaiming": nn.init.kaiming_normal_}.get(scheme, nn.init.xavier_uniform_)
     for layer in block.modules():
@@ -949,9 +951,8 @@ def block_init(block: Block, scheme: str, blocks: int) -> None:
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)
     if scheme == "tfixup":
-        with torch.no_grad():
-            for layer in (block.attention.value, block.attention.output, block.projection):
-                layer.weight.mul_(0.67 * blocks**-0.25)
+        for layer in (block.attention.value, block.attention.output, block.projection):
+            layer.weight.detach().mul_(0.67 * num_blocks**-0.25)
 
 
 # ---- 5 AGENT ----
@@ -983,7 +984,7 @@ class AtariCNN(nn.Sequential):
         """Map pixels (B, height, width, channels), uint8 or float in [0, 1], to features (B, F)."""
         scaled = pixels.float().mul_(1 / 255) if pixels.dtype == torch.uint8 else pixels
         features = super().forward(scaled.permute(0, 3, 1, 2))  # (B, channels, height, width)
-        return features.permute(0, 2, 3, 1).flatten(1)  # in the order they have in memory: no copy
+        return features.permute(0, 2, 3, 1).flatten(1)  # a view, since they are stored channels last
 
 
 class Encoder(nn.Module):
@@ -1021,8 +1022,8 @@ class Heads(nn.Module):
         super().__init__()
         self.nvec = nvec  # number of actions of each branch, as Gymnasium calls it
         self.trunk = layer_init(nn.Linear(width, size))
-        self.policy = head(size, sum(nvec), 0.1)
-        self.value = head(size, 1, value_gain)
+        self.policy = mlp_head(size, sum(nvec), 0.1)
+        self.value = mlp_head(size, 1, value_gain)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Map the memory's output (B, D) to the logits of all branches, values (B,) and features (B, F)."""
@@ -1035,8 +1036,8 @@ class Heads(nn.Module):
         return [Categorical(logits=part, validate_args=False) for part in logits.split(self.nvec, -1)]
 
 
-def head(size: int, outputs: int, gain: float) -> nn.Sequential:
-    """Make a head with a layer of its own."""
+def mlp_head(size: int, outputs: int, gain: float) -> nn.Sequential:
+    """Make a head of two layers; gain initializes the last one."""
     return nn.Sequential(
         layer_init(nn.Linear(size, size)), nn.ReLU(inplace=True), layer_init(nn.Linear(size, outputs), gain)
     )
@@ -1082,36 +1083,36 @@ class Agent(nn.Module):
         images = [space[name].shape for name in self.encoder.images]
         if args.reconstruction_coef and len(images) != 1:
             raise ValueError(f"--reconstruction-coef needs an observation with one image, not {len(images)}; use 0")
-        with torch.random.fork_rng([]):  # with and without these, the random numbers that follow are the same
+        with torch.random.fork_rng(devices=[]):  # they do not change the random numbers that are drawn later
             self.decoder = Decoder(args.trunk_size, images[0]) if args.reconstruction_coef else None
-            self.estimator = head(args.trunk_size, ground_truth_size, 1.0) if args.ground_truth_coef else None
+            self.estimator = mlp_head(args.trunk_size, ground_truth_size, 1.0) if args.ground_truth_coef else None
 
-    def get_action_and_value(self, obs: dict[str, Tensor], memory: MemoryState) -> tuple[Tensor, Tensor, Tensor]:
-        """Take one step of all environments, which the memory's state stores.
+    def get_action_and_value(self, obs: dict[str, Tensor], state: MemoryState) -> tuple[Tensor, Tensor, Tensor]:
+        """Act in all environments, and move the memory's state on to the next step.
 
         Returns actions (N, A), their log-probabilities (N, A) and values (N,).
         """
-        x, stored = self.memory.step(memory, self.encoder(obs))
-        self.memory.store(memory, stored)
+        x, hidden = self.memory.step(state, self.encoder(obs))
+        self.memory.advance(state, hidden)
         logits, values, _ = self.heads(x)
         policy = self.heads.distributions(logits)
         actions = torch.stack([branch.sample() for branch in policy], -1)
         return actions, log_probs_of(policy, actions), values
 
-    def get_value(self, obs: dict[str, Tensor], memory: MemoryState) -> Tensor:
+    def get_value(self, obs: dict[str, Tensor], state: MemoryState) -> Tensor:
         """Return the values (N,) of observations that are not acted on; the memory's state stays as it is."""
-        x, _ = self.memory.step(memory, self.encoder(obs))
+        x, _ = self.memory.step(state, self.encoder(obs))
         return self.heads(x)[1]
 
     def evaluate_actions(
-        self, x: Tensor, actions: Tensor, pieces: Pieces, memory: MemoryState
+        self, x: Tensor, actions: Tensor, pieces: Pieces, state: MemoryState
     ) -> tuple[list[Categorical], Tensor, Tensor, Tensor]:
         """Recompute, with gradient, what `get_action_and_value` computed at the steps of the pieces.
 
         x: the steps' encoded observations (B, I). Returns the policy, a distribution of B actions for each branch, the
         log-probabilities (B, A) of the actions (B, A), values (B,) and features (B, F).
         """
-        logits, values, features = self.heads(self.memory.unroll(memory, x, pieces))
+        logits, values, features = self.heads(self.memory.unroll(state, x, pieces))
         policy = self.heads.distributions(logits)
         return policy, log_probs_of(policy, actions), values, features
 
@@ -1123,26 +1124,24 @@ def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
 
 # ---- 6 MAIN ----
 def setup(args: Args) -> Run:
-    """Check the arguments and make all that a training needs; its files come last.
+    """Check the arguments and make all that a training needs, its files last, so that bad input raises before.
 
-    Bad input raises before anything is written. Raises ValueError, OSError, ImportError or gymnasium.error.Error, each
-    with one line for the user.
+    Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
     """
     script = Path(__file__).stem
-    device, checkpoint = prepare(args, script, Memory.longest_piece(args))
+    device, checkpoint = prepare(args, script, Memory.longest_piece(args))  # checkpoint: None without --resume
     with report_out_of_memory(args, device):
         envs = training_envs(args, checkpoint)
         obs, infos = envs.reset()
         agent = make_agent(Agent, envs, infos, args).to(device)
         rollout = Rollout.allocate(args.num_steps, obs, ground_truth_of(infos, args), agent)
-    # The learning rate is a tensor, thus of float32. A float, which is of float64, would be simpler, but would change
-    # rounding, and with it the curves of docs/results.md. The weight decay is torch's default.
-    optimizer = torch.optim.AdamW(agent.parameters(), lr=torch.tensor(args.init_lr), weight_decay=0.01, fused=True)
-    return open_run(args, Run(script, envs, agent, optimizer, rollout), checkpoint)
+    optimizer = torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)
+    run = Run(script=script, envs=envs, agent=agent, optimizer=optimizer, rollout=rollout)
+    return open_run(args, run, checkpoint)  # sets all of it to the checkpoint's state, if there is one
 
 
 def main(args: Args) -> Path:
-    """Train an agent as the arguments say; return the run folder. Raises what `setup` and `run_to_end` raise."""
+    """Train an agent from Python; return the run folder. Raises what `setup` and `run_to_end` raise."""
     return run_to_end(args, setup(args), train)
 
 

@@ -40,7 +40,7 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
 
 import evaluate
-from ppo_utils.flags import check_args
+from ppo_utils.flags import check_args, check_minibatches
 from ppo_utils.runs import parse_args
 
 ROOT = Path(__file__).parent.parent
@@ -274,9 +274,11 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
         flags += [f"--{each.replace('_', '-')}", str(value)]
     flags += f"{dashes}{further}".split()
     try:
+        module = importlib.import_module(Path(script).stem)
         parsed = parse(script, *flags)
         args = replace(parsed, seed=seed)
         check_args(args)
+        check_minibatches(args, module.Memory.longest_piece(args))
     except (ValueError, OSError) as error:
         raise SystemExit(f"{agent}: {error}") from None
     theirs = {each: getattr(args, each) for each in of_the_suite}

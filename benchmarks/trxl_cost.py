@@ -57,7 +57,7 @@ def kept_for_backward(run, args: ppo_trxl.Args) -> list[torch.Tensor]:
     minibatch = next(memory.cut(rollout.terminated).minibatches(args.num_minibatches))
     x = torch.randn(int(minibatch.length.sum()), memory.width, requires_grad=True)
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        memory.unroll(rollout.memory, x, minibatch)
+        memory.unroll(rollout.memory_state, x, minibatch)
     weights = {parameter.untyped_storage().data_ptr() for parameter in memory.parameters()}
     return [tensor for tensor in kept if tensor.untyped_storage().data_ptr() not in weights]
 
@@ -68,10 +68,10 @@ def shares(config: Config) -> None:
     run = ppo_trxl.setup(args)
     ppo_trxl.train(args, run)
     resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6  # kilobytes on Linux
-    memory = run.rollout.memory
+    memory = run.rollout.memory_state
     rows = {
         "highest resident memory, all in all": resident,
-        "stored hidden states": megabytes([memory.hidden, memory.stored_step]),
+        "stored hidden states": megabytes([memory.hidden, memory.row_step]),
         "cache of keys and values": megabytes([memory.keys, memory.values]),
         "kept of a minibatch for the backward pass": megabytes(kept_for_backward(run, args)),
     }
@@ -93,7 +93,7 @@ def step_times(config: Config, window: int) -> tuple[float, float]:
     for _ in range(config.repeats):
         start = time.perf_counter()
         _, hidden = memory.step(state, x)
-        memory.store(state, hidden)
+        memory.advance(state, hidden)
         step.append(time.perf_counter() - start)
         rows, _, mask = memory.attended_rows(state)
         start = time.perf_counter()

@@ -1,7 +1,7 @@
 """Models and checkpoints: what a file holds, how it is written and read, and how a run goes on from it.
 
-A model has a script's name, its arguments, the weights and the step; a checkpoint also has all that the run goes on
-with, in tensors and plain values, which torch.load(weights_only=True) takes.
+A model has a script's name, its arguments, the weights and the step; a checkpoint also has everything that the run
+needs to go on, in tensors and plain values, which torch.load(weights_only=True) takes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ if TYPE_CHECKING:
     from ppo_utils.runs import Run
 
 T = TypeVar("T")  # a script's Args
-RENAMED = {"head_size": "trunk_size"}  # flags, by the names that they have in older files
+# Names that flags and weights have in older files.
+RENAMED = {"head_size": "trunk_size"}
+RENAMED_WEIGHTS = {".norm_items.": ".norm_memory."}
 CHECKPOINTS_KEPT = 2
 
 
@@ -44,11 +46,17 @@ def model_of(args: Any, run: Run) -> dict[str, Any]:
 
 
 def save_checkpoint(args: Any, run: Run) -> None:
-    """Write all that a run goes on with, and keep the checkpoint before it. Raises what `write_file` raises."""
+    """Write all that a run goes on with, and keep the checkpoint before it.
+
+    Raises what `write_file` raises, and RunError if another process has ended.
+    """
     processes = all_gather(state_of_process(run))
     if run.writer is None:
         return
     run.writer.flush()  # a checkpoint means that the curves are there too
+    for path in run.folder.glob("events.*"):
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
     saved = {"seconds": run.seconds, "returns": list(run.returns), "lengths": list(run.lengths)}
     saved["optimizer"] = run.optimizer.state_dict()
     saved["processes"] = map_nested(processes, np.ndarray, torch.from_numpy)  # weights_only loads no arrays
@@ -64,7 +72,7 @@ def state_of_process(run: Run) -> dict[str, Any]:
         "environments": save_state(run.envs),
         "next_obs": rollout.next_obs,
         "next_ground_truth": rollout.next_ground_truth,
-        "memory": run.agent.memory.carry(rollout.memory),
+        "memory": run.agent.memory.carry(rollout.memory_state),
         "torch": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state(rollout.values.device) if rollout.values.is_cuda else None,
         "numpy": np.random.get_state(),  # noqa: NPY002 (it and Python's: environments of other packages may use them)
@@ -82,7 +90,7 @@ def write_file(saved: dict[str, Any], path: Path) -> None:
     if not all(weight.isfinite().all() for weight in saved["weights"].values()):
         raise FloatingPointError(f"{path} is not written, since weights are not finite; try a lower --init-lr")
     part, content = Path(f"{path}.part"), io.BytesIO()
-    torch.save(saved, content)
+    torch.save(saved, content)  # to a file, it would raise RuntimeError where the disk is full
     try:
         with part.open("wb") as file:
             file.write(content.getbuffer())
@@ -136,7 +144,11 @@ def read_model(path: str | Path) -> dict[str, Any]:
     content = io.BytesIO(Path(path).read_bytes())
     try:
         saved = torch.load(content, map_location="cpu", weights_only=True)
-        return {**saved, "script": saved["script"], "args": dict(saved["args"]), "weights": dict(saved["weights"])}
+        args = {RENAMED.get(name, name): value for name, value in saved["args"].items()}
+        weights = dict(saved["weights"])
+        for before, now in RENAMED_WEIGHTS.items():
+            weights = {name.replace(before, now): weight for name, weight in weights.items()}
+        return {**saved, "script": saved["script"], "args": args, "weights": weights}
     except Exception:  # torch.load raises many kinds of errors for a wrong file, and none tells more
         raise ValueError(f"{path} is cut short, or neither a model nor a checkpoint") from None
 
@@ -144,8 +156,7 @@ def read_model(path: str | Path) -> dict[str, Any]:
 def saved_args(kind: type[T], saved: dict[str, Any]) -> T:
     """Return the arguments, of a script's Args, in what `read_model` read; a flag that is newer has its default."""
     known = {each.name for each in fields(kind)}
-    given = {RENAMED.get(name, name): value for name, value in saved["args"].items()}
-    return kind(**{name: value for name, value in given.items() if name in known})
+    return kind(**{name: value for name, value in saved["args"].items() if name in known})
 
 
 def import_script(saved: dict[str, Any], path: str | Path) -> ModuleType:
@@ -157,13 +168,14 @@ def import_script(saved: dict[str, Any], path: str | Path) -> ModuleType:
     if "" not in sys.path:
         sys.path.append("")  # the current folder, after all others
     try:
-        if not re.fullmatch(r"ppo_\w+", name):
-            raise ModuleNotFoundError(name=name)
-        return importlib.import_module(name)
+        script = importlib.import_module(name) if re.fullmatch(r"ppo_\w+", name) else None
     except ModuleNotFoundError as error:
         if error.name != name:
             raise
-        raise ValueError(f"{path} was trained by {name}.py, which is not here; run this beside that script") from None
+        script = None
+    if not hasattr(script, "Args"):
+        raise ValueError(f"{path} was trained by {name}.py, which is not here; run this beside that script")
+    return script
 
 
 def make_agent(kind: type[nn.Module], envs: gym.vector.VectorEnv, infos: dict, args: Any) -> nn.Module:
@@ -201,6 +213,9 @@ def check_resumed(args: Any, saved: dict[str, Any], script: str) -> None:
     if "processes" not in saved:
         raise ValueError(f"--resume {args.resume}: its last checkpoint holds weights alone; --load-model takes these")
     theirs = saved_args(type(args), saved)
+    if gone := saved["args"].keys() - asdict(theirs).keys():
+        names = " ".join(map(flag, sorted(gone)))
+        print(f"--resume {args.resume}: it goes on without {names}, which no longer exist", file=sys.stderr)
     for name in (each.name for each in fields(args) if each.name not in ("resume", "total_timesteps")):
         if getattr(args, name) != getattr(theirs, name):
             raise ValueError(
@@ -234,24 +249,33 @@ def load_model(args: Any, agent: nn.Module, script: str) -> None:
     load_weights(agent, saved, path)
 
 
-@torch.no_grad()
-def load_checkpoint(run: Run, saved: dict[str, Any]) -> None:
-    """Set a run that was just made to what `save_checkpoint` wrote: it goes on as if it had never stopped.
+def load_learner(run: Run, saved: dict[str, Any], folder: str | Path) -> None:
+    """Set the agent, the optimizer and what is counted to what a folder's checkpoint holds.
 
-    Environments of other packages begin new episodes, with a line that says so. Raises ValueError if weights, optimizer
-    or environments do not fit.
+    Raises ValueError if weights or optimizer do not fit, or if the checkpoint is of an older version.
     """
-    load_weights(run.agent, saved, run.folder)
+    load_weights(run.agent, saved, folder)
     run.optimizer.load_state_dict(saved["optimizer"])
-    for weight, moments in run.optimizer.state.items():
-        if moments["exp_avg"].shape != weight.shape:  # torch tells the weights apart by their order alone
-            raise ValueError(
-                f"{run.folder}: its checkpoint is of a version with the weights in another order, and training cannot "
-                "go on from it; --load-model takes its weights"
-            )
+    moments = [(weight, each["exp_avg"]) for weight, each in run.optimizer.state.items()]
+    same_order = all(weight.shape == moment.shape for weight, moment in moments)  # torch goes by their order alone
+    memory = saved["processes"][rank_and_size()[0]]["memory"]
+    if not same_order or run.rollout.initial_memory.keys() - memory.keys():
+        raise ValueError(
+            f"{folder}: its checkpoint is of an older version, and training cannot go on from it; --load-model takes "
+            "its weights"
+        )
     run.step, run.seconds = saved["step"], saved["seconds"]
     run.returns.extend(saved["returns"])
     run.lengths.extend(saved["lengths"])
+
+
+@torch.no_grad()
+def load_process(run: Run, saved: dict[str, Any]) -> None:
+    """Set environments, memory and generators to what `state_of_process` returned: the run goes on from there.
+
+    Environments of other packages begin new episodes, with a line that says so. Raises ValueError if the state is one
+    of other environments.
+    """
     rank, rollout = rank_and_size()[0], run.rollout
     state = saved["processes"][rank]
     random.setstate(state["python"])
@@ -267,4 +291,4 @@ def load_checkpoint(run: Run, saved: dict[str, Any]) -> None:
         return
     load_state(run.envs, arrays["environments"])
     rollout.next_obs, rollout.next_ground_truth = arrays["next_obs"], arrays["next_ground_truth"]
-    run.agent.memory.begin_rollout(rollout.memory, state["memory"])
+    run.agent.memory.begin_rollout(rollout.memory_state, state["memory"])

@@ -1,8 +1,8 @@
 """Environments ready to train on: any Gymnasium id, whatever it observes and however it resets.
 
-`make_envs` is a table of contents of vector wrappers, `envs_for` calls it with a script's arguments; `save_state` and
-`load_state` copy the state of all of them. What a training counts and logs is read from infos: `ground_truth_of`,
-`final_numbers` and `final_observations` take it from them.
+`make_envs` puts the vector wrappers around an environment, in order; `envs_for` calls it with a script's arguments.
+`save_state` and `load_state` copy the state of all of them. What a training counts and logs is read from infos:
+`ground_truth_of`, `final_numbers` and `final_observations` take it from them.
 A lane is one of the N environments that step together.
 Shape letters: N lanes, A action branches, G entries of the ground truth.
 """
@@ -29,6 +29,7 @@ from memory_gym_envs.base import checked_integer
 from memory_gym_envs.options import brief
 from memory_gym_envs.saving import Saved
 from ppo_utils.observations import ObservationParts
+from ppo_utils.processes import rank_and_size
 from ppo_utils.wrappers import (
     FourierFeatures,
     GrayscaleStack,
@@ -46,6 +47,16 @@ def envs_for(args: Any, num_envs: int, **kwargs: Any) -> VectorEnv:
     names += ("frame_stack", "step_encoding", "observe_last_action", "spotlight_perturbation", "vector_frequencies")
     kwargs |= {name: getattr(args, name) for name in names}
     return make_envs(args.env_id, num_envs, options=parse_options(args.env_id, args.env_options), **kwargs)
+
+
+def training_envs(args: Any, checkpoint: dict[str, Any] | None) -> VectorEnv:
+    """Make this process's share of the environments to train on. Raises as `make_envs` does."""
+    rank, processes = rank_and_size()
+    share = args.num_envs // processes
+    # Environments that cannot be restored must not repeat the episodes that the run began with.
+    seed = args.seed if checkpoint is None or checkpoint["step"] == 0 else [args.seed, checkpoint["step"]]
+    mode = "debug_rgb_array" if args.capture_video else None
+    return envs_for(args, share, seed=seed, first_lane=rank * share, render_mode=mode)
 
 
 def as_tensors(obs: dict[str, np.ndarray], device: torch.device) -> dict[str, Tensor]:
@@ -73,7 +84,7 @@ def make_envs(
     """Make a vector environment of N lanes with same-step autoreset; the caller's `reset()` begins.
 
     env_id: a Gymnasium id, or "module:id" if importing a module registers it.
-    seed: of all lanes, an integer or several from 0; the lanes get streams of their own, and the next reset needs none.
+    seed: of all lanes, an integer or several from 0; each lane gets its own random stream, and the next reset no seed.
     first_lane: the lanes are number first_lane, first_lane + 1, ... of a larger set: with the same seed, they have the
         seeds and play the episodes of these lanes of it. Vector environments of other packages may seed all lanes
         together, and then do not.
@@ -127,7 +138,7 @@ def make_envs(
             # Neighbouring seeds must not share lanes, so the lanes' seeds count up from a hash of the seed.
             first_seed = int(np.random.SeedSequence(seed).generate_state(1)[0]) + first_lane
             envs.reset(seed=first_seed)
-    locate_errors(envs.unwrapped, first_lane, first_seed)  # only now, since the errors above have their own words
+    locate_errors(envs.unwrapped, first_lane, first_seed)  # only now: the errors above already say what failed
     # An explicit seed is a level of its own, which nobody plays: what counts episodes comes after it.
     return EpisodeStatistics(envs)
 
@@ -138,7 +149,7 @@ def make_envs(
 def save_state(envs: VectorEnv) -> dict[str, Any] | None:
     """Return the whole state of environments from `make_envs`, or None if there are parts of other packages in them.
 
-    They may be in a `LaneVideo`, whose state is the number of the episode.
+    They may be in a `LaneVideo`, whose state is the numbers of the episode and the step.
     Saved are: every array of the environment, with the levels that are being played; each lane's generator and its
     seed, and the one that chooses levels; the present options, which automatic resets keep; frame stacks, step numbers
     and last actions; the lights of the perturbation and their generators; returns and lengths of the episodes so far,
@@ -190,7 +201,7 @@ def set_states(parts: list[Saved], states: list[dict[str, Any]]) -> None:
 
 
 def saved_parts(envs: VectorEnv) -> list[Saved] | None:
-    """The environment and its wrappers that have a state, from the inside out; None if one's is not known.
+    """Return the environment and its wrappers that have a state, from the inside out; None if one's is not known.
 
     Raises ValueError for a single environment.
     """
@@ -209,7 +220,7 @@ def saved_parts(envs: VectorEnv) -> list[Saved] | None:
 
 
 def describe(parts: list[Saved]) -> dict[str, Any]:
-    """What environments with these parts were made with: a state of one fits the other if this is equal."""
+    """Return what environments with these parts were made with; a state fits if this is equal."""
     environment, *wrappers = parts
     names = [type(wrapper).__name__ for wrapper in wrappers]
     values = {**environment.arguments, "wrappers": ", ".join(names)}
@@ -222,7 +233,7 @@ def describe(parts: list[Saved]) -> dict[str, Any]:
 
 
 def find_spec(env_id: str) -> EnvSpec:
-    """What is registered for the id, or for "module:id" once the module is imported.
+    """Return what is registered for the id, or for "module:id" once the module is imported.
 
     Raises ImportError for a module that is not installed, gymnasium.error.Error for an id that is not registered.
     """
@@ -243,7 +254,7 @@ def find_spec(env_id: str) -> EnvSpec:
 
 
 def is_memory_gym(env_id: str) -> bool:
-    """Whether the id is one of this package's environments, which have levels and reset parameters."""
+    """Return whether the id is one of this package's environments, which have levels and reset parameters."""
     return str(find_spec(env_id).entry_point).startswith("memory_gym_envs")
 
 
@@ -251,7 +262,7 @@ def parse_options(env_id: str, text: str) -> dict[str, Any] | None:
     """Parse --env-options; raise ValueError if it is no JSON object or the environment has no such parameters."""
     try:
         options = json.loads(text)
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"--env-options is no JSON ({error}): {text}") from None
     if not isinstance(options, dict):
         raise ValueError(f'--env-options must be a JSON object such as {{"visual_feedback": false}}, not {text}')
@@ -280,12 +291,12 @@ def same_step_envs(spec: EnvSpec, num_envs: int, kwargs: dict[str, Any]) -> Vect
 
 
 def creator(entry_point: str | Callable) -> Callable:
-    """What makes the environment: its class, as a rule."""
+    """Return what makes the environment: its class, as a rule."""
     return load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
 
 
 def resets_in_same_step(envs: Any) -> bool:
-    """Whether the metadata of an environment, or of its class, says so."""
+    """Return whether the metadata of an environment, or of its class, says so."""
     return getattr(envs, "metadata", {}).get("autoreset_mode") == AutoresetMode.SAME_STEP
 
 
@@ -304,7 +315,7 @@ def one_line_errors(what: str) -> Iterator[None]:
 
 
 def one_line(error: Exception) -> str:
-    """The error's message without line breaks; empty if it has none."""
+    """Return the error's message without line breaks; empty if it has none."""
     return " ".join(str(error).split())
 
 
@@ -323,7 +334,7 @@ class LaneErrors(gym.Wrapper):
         self._lane, self._seed, self._steps = lane, seed, 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """The environment's reset. Raises RuntimeError for what it raises."""
+        """Reset the environment. Raises RuntimeError for what it raises."""
         if seed is not None:
             self._seed, self._steps = seed, 0
         try:
@@ -332,7 +343,7 @@ class LaneErrors(gym.Wrapper):
             raise self._located(error, "the reset after step") from error
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """The environment's step. Raises RuntimeError for what it raises."""
+        """Step the environment. Raises RuntimeError for what it raises."""
         self._steps += 1
         try:
             return self.env.step(action)
@@ -409,7 +420,7 @@ def final_numbers(infos: dict[str, Any], lanes: np.ndarray) -> Iterator[tuple[st
 def final_observations(
     observations: dict[str, np.ndarray], infos: dict[str, Any], lanes: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Copies of observations (N, ...) in which the given lanes hold the last one of the episode that just ended.
+    """Return copies of observations (N, ...) in which the given lanes hold the last one of the episode that just ended.
 
     lanes: (N,) bool.
     """
@@ -427,11 +438,11 @@ class EpisodeStatistics(Saved, RecordEpisodeStatistics):
     queues = ("return_queue", "length_queue")
 
     def get_state(self) -> dict[str, Any]:
-        """Returns and lengths so far, and those of the last ended episodes."""
+        """Return returns and lengths so far, and those of the last ended episodes."""
         return {**super().get_state(), **{name: np.array(getattr(self, name)) for name in self.queues}}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Takes over a copy of what get_state() returned."""
+        """Take over a copy of what get_state() returned."""
         super().set_state(state)
         for name in self.queues:
             getattr(self, name).clear()

@@ -18,7 +18,7 @@ REPEATS = 3  # times that each level is played
 def evaluation_levels(args: Any, levels: int, repeats: int = REPEATS) -> list[int]:
     """Return the seeds (N,) of an evaluation's levels: those that follow the training levels, with repeats."""
     first = args.start_level + args.num_levels
-    return [first + level for level in range(levels) for _ in range(repeats)]
+    return [level for level in range(first, first + levels) for _ in range(repeats)]
 
 
 @torch.no_grad()

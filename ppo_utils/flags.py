@@ -25,14 +25,15 @@ class Bounds(NamedTuple):
         return self.low < number <= self.high if self.above else self.low <= number <= self.high
 
 
-def bounded(kind: type, *bounds: Any) -> Any:
+def bounded(kind: type, *bounds: float, **more: bool) -> Any:
     """Return the type of a flag with these `Bounds`: --help shows them, and `check_args` enforces them."""
-    return Annotated[kind, Bounds(*bounds), tyro.conf.arg(metavar=f"{kind.__name__.upper()} ({Bounds(*bounds)})")]
+    bounds = Bounds(*bounds, **more)
+    return Annotated[kind, bounds, tyro.conf.arg(metavar=f"{kind.__name__.upper()} ({bounds})")]
 
 
 PositiveInt = bounded(int, 1)
 NonNegativeInt = bounded(int, 0)
-PositiveFloat = bounded(float, 0, float("inf"), True)
+PositiveFloat = bounded(float, 0, above=True)
 NonNegativeFloat = bounded(float, 0)
 UnitInterval = bounded(float, 0, 1)
 

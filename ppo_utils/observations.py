@@ -47,12 +47,12 @@ class ObservationParts(VectorWrapper):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """The environment's reset, its observations in parts."""
+        """Reset the environment, its observations in parts."""
         observations, infos = self.env.reset(seed=seed, options=options)
         return self.parts(observations), infos
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], Any, Any, Any, dict[str, Any]]:
-        """One step of every lane, its observations in parts, those in `final_obs` too."""
+        """Step every lane, its observations in parts, those in `final_obs` too."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         if "final_obs" in infos:
             space, final = self.env.single_observation_space, infos["final_obs"]
@@ -63,13 +63,13 @@ class ObservationParts(VectorWrapper):
         return self.parts(observations), rewards, terminated, truncated, infos
 
     def parts(self, observations: Any) -> dict[str, np.ndarray]:
-        """The parts of observations, each (N, ...); no copies of what is right already."""
+        """Return the parts of observations, each (N, ...); no copies of what is right already."""
         given = named(observations)
         return {name: convert(given[name]) for name, convert in self._convert.items()}
 
 
 def converter(name: str, space: gym.Space) -> Callable[[Any], np.ndarray]:
-    """What makes pictures or vectors of a batch of this part of the observations; ValueError if nothing can."""
+    """Return what makes pictures or vectors of a batch of this part of the observations; ValueError if nothing can."""
     if isinstance(space, gym.spaces.Box):
         layout = picture_layout(space.shape)
         if layout is not None and (space.dtype == np.uint8 or (space.low.min() >= 0 and space.high.max() <= 1)):
@@ -86,7 +86,7 @@ def converter(name: str, space: gym.Space) -> Callable[[Any], np.ndarray]:
 
 
 def converted_space(space: gym.Space, convert: Callable[[Any], np.ndarray]) -> gym.spaces.Box:
-    """The space of what `converter` makes of one observation from this space."""
+    """Return the space of what `converter` makes of one observation from this space."""
     with np.errstate(over="ignore"):  # bounds beyond float32 become infinite
         if convert.func is as_vectors:
             flat = gym.spaces.flatten_space(space)
@@ -96,14 +96,14 @@ def converted_space(space: gym.Space, convert: Callable[[Any], np.ndarray]) -> g
 
 
 def picture_layout(shape: tuple[int, ...]) -> str | None:
-    """Which axes of a Box are a picture's: height, width and channels; None if it is too small to be one."""
+    """Return which axes of a Box are a picture's: height, width and channels; None if it is too small to be one."""
     large = tuple(side >= SMALLEST_PICTURE for side in shape)
     layouts = {(True, True): "HW", (True, True, False): "HWC", (True, True, True): "HWC", (False, True, True): "CHW"}
     return layouts.get(large)
 
 
 def as_pictures(layout: str, values: np.ndarray) -> np.ndarray:
-    """A batch of pictures in this layout as (N, H, W, C), bytes or float32."""
+    """Return a batch of pictures in this layout as (N, H, W, C), bytes or float32."""
     if layout == "HW":
         values = values[..., None]
     elif layout == "CHW":
@@ -112,7 +112,7 @@ def as_pictures(layout: str, values: np.ndarray) -> np.ndarray:
 
 
 def as_vectors(space: gym.Space, values: Any) -> np.ndarray:
-    """What Gymnasium's `flatten` makes of each of a batch of observations, (N, V) float32, all lanes at once."""
+    """Return what Gymnasium's `flatten` makes of each of a batch of observations, (N, V) float32, all lanes at once."""
     if isinstance(space, gym.spaces.Dict):
         return np.concatenate([as_vectors(part, values[name]) for name, part in space.spaces.items()], axis=1)
     if isinstance(space, gym.spaces.Tuple):
@@ -126,7 +126,7 @@ def as_vectors(space: gym.Space, values: Any) -> np.ndarray:
 
 
 def is_flattenable(space: gym.Space) -> bool:
-    """Whether `as_vectors` knows the space, and what is in it."""
+    """Return whether `as_vectors` knows the space, and what is in it."""
     if isinstance(space, (gym.spaces.Dict, gym.spaces.Tuple)):
         inside = list(named(space).values()) if isinstance(space, gym.spaces.Dict) else space.spaces
         return bool(inside) and all(map(is_flattenable, inside))
@@ -135,5 +135,5 @@ def is_flattenable(space: gym.Space) -> bool:
 
 
 def is_text(space: gym.Space) -> bool:
-    """Whether the space is of strings: Gymnasium's Text, or one of a package's own such as MiniGrid's missions."""
+    """Return whether the space is of strings: Gymnasium's Text, or a package's own, such as MiniGrid's missions."""
     return space.dtype is not None and space.dtype.kind == "U"

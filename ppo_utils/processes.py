@@ -44,6 +44,8 @@ def report_lost_process() -> Iterator[None]:
     """Raise RunError if another process does not answer."""
     try:
         yield
+    except torch.OutOfMemoryError:
+        raise
     except RuntimeError as error:  # what Gloo and NCCL raise
         raise RunError("another process of this run has ended; its own output says why") from error
 
@@ -74,11 +76,13 @@ def average_gradients(agent: nn.Module, num_steps: int) -> None:
 
 
 def combine_logs(parts: list[tuple[dict, dict]]) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """Return the means of what the processes logged, and the episodes of all. A maximum is the maximum of all."""
+    """Return the means of what the processes logged, of losses/ratio_error the maximum, and the episodes of all."""
     logs, episodes = zip(*parts, strict=True)
     values_of = {name: [each[name] for each in logs if name in each] for name in logs[0]}
-    combined = {name: float(np.mean(values)) for name, values in values_of.items()}
-    combined["losses/ratio_error"] = max(values_of["losses/ratio_error"])
+    combined = {
+        name: float(np.max(values) if name == "losses/ratio_error" else np.mean(values))
+        for name, values in values_of.items()
+    }
     joined = defaultdict(list)
     for each in episodes:
         for name, values in each.items():

@@ -1,13 +1,16 @@
-"""A training from its first file to its last line: run folder, logs, progress bar, signals, and the command line.
+"""Run folder, logs, progress bar, signals and the command line of a training.
 
-A script's `setup` calls `prepare`, makes its agent, and ends with `open_run`; its `train` calls `report` after each
-iteration; `run_to_end` and `command` call both.
+A script's `setup` calls `prepare`, makes its agent, and ends with `open_run`; its `train` calls `end_iteration` after
+each iteration. `run_to_end` calls `train`; `command` calls `setup`, then `run_to_end`.
 """
 
 import argparse
 import contextlib
+import fcntl
 import os
 import random
+import re
+import shlex
 import signal
 import sys
 import threading
@@ -17,13 +20,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, fields
 from itertools import count
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, NoReturn, TypeVar
 
 import gymnasium as gym
 import numpy as np
 import torch
+import torch.distributed as dist
 import tyro
-from filelock import BaseFileLock, FileLock, Timeout
 from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -31,8 +34,9 @@ from tqdm import tqdm
 from ppo_utils.checkpoints import (
     check_resumed,
     checkpoints_in,
-    load_checkpoint,
+    load_learner,
     load_model,
+    load_process,
     model_of,
     read_checkpoint,
     save_checkpoint,
@@ -50,7 +54,7 @@ from ppo_utils.processes import (
     leave_processes,
     rank_and_size,
 )
-from ppo_utils.video import LaneVideo, check_can_film
+from ppo_utils.video import LaneVideo, check_can_film, check_draws
 
 T = TypeVar("T")  # a script's Args
 
@@ -66,23 +70,23 @@ class Run:
     rollout: Any  # a script's Rollout
     folder: Path = Path()  # named by `open_run`
     eval_envs: gym.vector.VectorEnv | None = None
-    lock: BaseFileLock | None = None  # tells other processes that the folder is in use
-    writer: SummaryWriter | None = None  # in the first process only, as the progress bar
+    lock: IO | None = None  # a locked file, which tells other processes that the folder is in use
+    writer: SummaryWriter | None = None  # in the first process only, like the progress bar
     bar: tqdm | None = None
     iteration: int = 0  # the current one, from 1
     step: int = 0  # so far, of all environments together
     seconds: float = 0.0  # of training, without evaluations
     returns: deque = field(default_factory=lambda: deque(maxlen=100))  # of the last episodes, for the progress bar
     lengths: deque = field(default_factory=lambda: deque(maxlen=100))
-    received_signal: int = 0  # SIGTERM or SIGINT, if this process got one
+    received_signal: int = 0  # number of the signal (SIGINT or SIGTERM) that this process got, or 0
     stop: bool = False  # a process got one: this iteration is the last
     episodes: dict[str, list[float]] = field(default_factory=dict)  # metrics of those that ended in the last iteration
-    scores: dict[str, torch.Tensor] = field(default_factory=dict)  # of the last evaluation, see `level_scores`
+    scores: dict[str, torch.Tensor] = field(default_factory=dict)  # of its evaluation, see `level_scores`
 
 
 # ---- setting up ----
 def parse_args(kind: type[T], presets: dict[str, dict[str, Any]], argv: list[str]) -> T:
-    """Parse a command line into a script's Args; its flags win over --preset, or over what the run of --resume has.
+    """Parse a command line into a script's Args; its flags override --preset, or the run that --resume names.
 
     Raises what `read_checkpoint` raises.
     """
@@ -90,8 +94,8 @@ def parse_args(kind: type[T], presets: dict[str, dict[str, Any]], argv: list[str
     first.add_argument("--preset", nargs="?")
     first.add_argument("--resume", nargs="?")
     given = first.parse_known_args(argv)[0]
-    default = kind(**presets.get(given.preset, {}))  # tyro reports an unknown one, as all errors
-    if given.resume is not None:
+    default = kind(**presets.get(given.preset, {}))  # tyro reports an unknown one below, like all other errors
+    if given.resume not in (None, "None"):  # as tyro reads it
         default = saved_args(kind, read_checkpoint(given.resume))
     held = {name: {k: v for k, v in values.items() if k != "preset"} for name, values in presets.items()}
     lines = [f"--preset {name} stands for {as_flags(values)}" for name, values in held.items() if values]
@@ -101,8 +105,8 @@ def parse_args(kind: type[T], presets: dict[str, dict[str, Any]], argv: list[str
 def prepare(args: Any, script: str, longest_piece: int) -> tuple[torch.device, dict[str, Any] | None]:
     """Check the arguments, join other processes and seed the generators; return the device and --resume's checkpoint.
 
-    longest_piece: the most steps that a piece of a rollout may have, of which minibatches are made. Raises ValueError,
-    OSError or ImportError, each with one line for the user.
+    longest_piece: the largest number of steps in a piece; minibatches are made of pieces. Raises ValueError, OSError,
+    ImportError or gymnasium.error.Error, each with one line for the user.
     """
     join_processes()
     checkpoint = None if args.resume is None else read_checkpoint(args.resume)
@@ -127,26 +131,16 @@ def seed_generators(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def training_envs(args: Any, checkpoint: dict[str, Any] | None) -> gym.vector.VectorEnv:
-    """Make this process's share of the environments to train on. Raises as `make_envs` does."""
-    rank, processes = rank_and_size()
-    share = args.num_envs // processes
-    # Environments that cannot be restored must not repeat the episodes that the run began with.
-    seed = args.seed if checkpoint is None or checkpoint["step"] == 0 else [args.seed, checkpoint["step"]]
-    mode = "debug_rgb_array" if args.capture_video else None
-    return envs_for(args, share, seed=seed, first_lane=rank * share, render_mode=mode)
-
-
 @contextlib.contextmanager
 def report_out_of_memory(args: Any, device: torch.device) -> Iterator[None]:
-    """Raise ValueError, naming what is larger than usual, if what is made inside does not fit in the memory."""
+    """Raise ValueError, naming the flags above their defaults, if what is made inside does not fit in the memory."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and "allocate" not in str(error):
+        if isinstance(error, RuntimeError) and not re.search("allocate|out of memory|overflowed", str(error)):
             raise
         harmless = ("seed", "total_timesteps", "start_level", "num_levels", "anneal_steps", "num_minibatches")
-        harmless += ("update_epochs", "checkpoint_interval", "keep_models", "eval_interval", "eval_max_steps")
+        harmless += ("update_epochs", "checkpoint_interval", "eval_interval", "eval_max_steps")
         sizes = [each for each in fields(args) if type(each.default) is int and each.name not in harmless]
         large = [each.name for each in sizes if getattr(args, each.name) > each.default] or ["num_envs", "num_steps"]
         large = " ".join(f"{flag(name)} {getattr(args, name)}" for name in large)
@@ -156,50 +150,53 @@ def report_out_of_memory(args: Any, device: torch.device) -> Iterator[None]:
 def open_run(args: Any, run: Run, checkpoint: dict[str, Any] | None) -> Run:
     """Load what --resume or --load-model names, and open the run's files, the last thing that a setup does.
 
-    run.folder is named here. Raises ValueError, OSError or ImportError, each with one line for the user.
+    run.folder is named here. Raises ValueError, OSError, ImportError or RunError, each with one line for the user.
     """
     rank, _ = rank_and_size()
     if args.eval_interval and rank == 0:
         with report_out_of_memory(args, torch.device("cpu")):
-            run.eval_envs = envs_for(args, len(evaluation_levels(args, args.eval_levels)))
+            run.eval_envs = envs_for(args, args.eval_levels * REPEATS)
     if rank > 0:  # all processes began with the same weights, but draw numbers of their own
         seed_generators(int(np.random.SeedSequence([args.seed, rank]).generate_state(1)[0]))
     if args.load_model is not None and checkpoint is None:
         load_model(args, run.agent, run.script)
     if checkpoint is not None:
-        run.step = checkpoint["step"]
+        load_learner(run, checkpoint, args.resume)
     if rank == 0:
         open_folder(args, run)
     run.folder = all_gather(run.folder)[0]
     if checkpoint is not None:
-        load_checkpoint(run, checkpoint)
+        load_process(run, checkpoint)
     if rank == 0:
         open_logs(args, run)
     return run
 
 
 def open_folder(args: Any, run: Run) -> None:
-    """Make a run folder, or take over the one of --resume, and film if asked to.
+    """Make a run folder, or take over the one of --resume, and record videos with --capture-video.
 
     Raises OSError if it cannot be written or is in use, or as `start_tracking` does.
     """
     run.folder = make_folder(args, run.script) if args.resume is None else Path(args.resume)
     if not os.access(run.folder, os.W_OK):
         raise OSError(f"--resume {run.folder}: this folder cannot be written")
+    run.lock = (run.folder / ".lock").open("w")
+    try:
+        fcntl.flock(run.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until the file is closed
+    except BlockingIOError:
+        raise OSError(f"--resume {run.folder}: another process is training this run") from None
+    except OSError:  # some network file systems have no locks
+        pass
+    if args.resume is not None and checkpoints_in(run.folder)[-1].stem != f"checkpoint-{run.step}":
+        raise OSError(f"--resume {run.folder}: another process has just gone on with this run; start again")
     if args.track:
         try:
             start_tracking(args, run.folder.resolve().name)
         except (ValueError, ImportError):
             if args.resume is None:
+                (run.folder / ".lock").unlink()
                 os.removedirs(run.folder)
             raise
-    run.lock = FileLock(run.folder / ".lock")
-    try:
-        run.lock.acquire(timeout=0)
-    except Timeout:
-        raise OSError(f"--resume {run.folder}: another process is training this run") from None
-    except NotImplementedError:  # some network file systems have no locks
-        run.lock = None
     for part in run.folder.glob("*.part"):
         part.unlink()  # of a process that was killed while it wrote
     if args.capture_video:
@@ -216,13 +213,13 @@ def make_folder(args: Any, script: str) -> Path:
             folder.mkdir(parents=True)
             return folder
         except OSError as error:
-            if not folder.is_dir():  # else another run has this name
+            if not os.path.isdir(folder):  # else another run has this name
                 where = "run where the folder runs can be written"
                 raise OSError(f"cannot make {folder} ({error.strerror}); {where}") from None
 
 
 def open_logs(args: Any, run: Run) -> None:
-    """Open the TensorBoard file, which hides what was logged beyond the run's step, and the progress bar."""
+    """Open a TensorBoard file, which hides older entries beyond the run's step, and the progress bar."""
     run.writer = SummaryWriter(str(run.folder), purge_step=run.step + 1 if run.step else None)
     hyperparameters = {"script": run.script, **asdict(args)}
     rows = "\n".join(f"|{key}|{' '.join(str(value).split())}|" for key, value in hyperparameters.items())
@@ -257,23 +254,23 @@ def report_failed_write(folder: Path) -> Iterator[None]:
         raise RunError(f"cannot write to {error.filename or folder} ({error.strerror})") from error
 
 
-def report(args: Any, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
+def end_iteration(args: Any, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
     """End an iteration: evaluate, log, and save, each where it is due.
 
-    Raises RunError if a file cannot be written or a process is gone, FloatingPointError if a weight is not finite.
+    logs need charts/seconds_iteration, the time that the iteration took. Raises RunError if a file cannot be written or
+    a process is gone, FloatingPointError if a weight is not finite.
     """
     iterations = args.total_timesteps // (args.num_envs * args.num_steps)
     is_last = run.iteration == iterations
-    if evaluates := run.eval_envs is not None and (run.iteration % args.eval_interval == 0 or is_last):
-        run.scores = level_scores(args, run)
-        logs |= {f"eval/{name}": values.mean().item() for name, values in run.scores.items()}
+    evaluates = run.eval_envs is not None and (run.iteration % args.eval_interval == 0 or is_last)
+    run.scores = level_scores(args, run) if evaluates else {}
+    logs |= {f"eval/{name}": values.mean().item() for name, values in run.scores.items()}
     run.stop = any(all_gather(run.received_signal))
     logs, episodes = combine_logs(all_gather((logs, episodes)))
     with report_failed_write(run.folder):
         write_logs(args, run, logs, episodes)
-        if evaluates:
-            for name, values in run.scores.items():
-                run.writer.add_tensor(f"eval_levels/{name}", values, run.step)
+        for name, values in run.scores.items():
+            run.writer.add_tensor(f"eval_levels/{name}", values, run.step)
         if args.checkpoint_interval and (run.iteration % args.checkpoint_interval == 0 or is_last or run.stop):
             save_checkpoint(args, run)
 
@@ -282,8 +279,8 @@ def level_scores(args: Any, run: Run) -> dict[str, torch.Tensor]:
     """Return an evaluation's metrics by name, (--eval-levels, REPEATS) float64: every episode on every level.
 
     Training goes on as if there had been none, unless an environment of another package takes random numbers from
-    NumPy's or Python's global generator. A metric that some episodes lack is left out: one that only an episode's end
-    tells is not known of the longest, which --eval-max-steps cut short.
+    NumPy's or Python's global generator. A metric is left out if some episodes lack it: what is reported only at an
+    episode's end is missing where --eval-max-steps cut the episode short.
     """
     device = run.rollout.values.device
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
@@ -308,8 +305,9 @@ def write_logs(args: Any, run: Run, logs: dict[str, float], episodes: dict[str, 
         run.writer.add_scalar(name, value, run.step)
     last = {"return": run.returns, "length": run.lengths}
     shown = {name: f"{np.mean(values):.2f}" for name, values in last.items() if values}
-    run.bar.set_postfix({**shown, "SPS": f"{logs['charts/SPS']:.0f}"}, refresh=False)
-    run.bar.update(args.num_envs * args.num_steps)
+    with contextlib.suppress(OSError):  # where the bar is shown may be gone, and the training goes on
+        run.bar.set_postfix({**shown, "SPS": f"{logs['charts/SPS']:.0f}"}, refresh=False)
+        run.bar.update(args.num_envs * args.num_steps)
 
 
 def stop_on_signals(run: Run) -> None:
@@ -317,14 +315,15 @@ def stop_on_signals(run: Run) -> None:
 
     A second SIGTERM does not: torchrun passes on the one that a cluster has sent to all processes.
     """
-    alone = rank_and_size()[1] == 1
+    alone = not dist.is_initialized()
 
     def stop(number: int, _: Any) -> None:
         if run.received_signal and number == signal.SIGINT and alone:
             raise KeyboardInterrupt
         if not run.received_signal and run.bar is not None:
             hint = "; Ctrl-C stops at once, without a checkpoint" if alone else ""
-            os.write(2, f"\nstopping at the end of this iteration{hint}\n".encode())  # print might be at work already
+            with contextlib.suppress(OSError):  # Ctrl-C has ended `tee` too; print might be at work already
+                os.write(2, f"\nstopping at the end of this iteration{hint}\n".encode())
         run.received_signal = number
 
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -336,7 +335,7 @@ def run_to_end(args: Any, run: Run, train: Callable[[Any, Run], None]) -> Path:
     """Train until it is done or stopped; return the run folder.
 
     With --save-model, what was learned is kept, unless the training diverged, a file could not be written or another
-    process ended. Raises FloatingPointError and RunError as `train` does, with the last checkpoint's name.
+    process ended. Raises FloatingPointError and RunError as `train` does, then with the last checkpoint's name.
     """
     save_model = args.save_model
     try:
@@ -364,35 +363,40 @@ def run_to_end(args: Any, run: Run, train: Callable[[Any, Run], None]) -> Path:
 
 
 def summary(args: Any, run: Run) -> str:
-    """Return the lines that a training ends with: what it reached, and the commands that go on from there."""
+    """Return the lines that a training ends with: what it reached, and the commands to go on with."""
     score = "no episode ended"
     if run.scores:
         score = f"return {run.scores['return'].mean():.2f} on {args.eval_levels} unseen levels"
     elif run.returns:
         score = f"return {np.mean(run.returns):.2f}, mean of the last {len(run.returns)} episodes"
-    models = [run.folder / "model.pt"] if args.save_model else checkpoints_in(run.folder)[-1:]
+    folder = shlex.quote(str(run.folder))
     lines = [f"{run.folder}: {run.step:,} steps, {score}"]
-    lines += [f"evaluate: python evaluate.py {path}" for path in models]
-    lines += [f"watch: python enjoy.py {path} --out page.html" for path in models]
-    return "\n".join([*lines, f"plot: tensorboard --logdir {run.folder}"])
+    checkpoints = checkpoints_in(run.folder)[-1:]
+    if run.stop and checkpoints:
+        lines.append(f"resume: python {run.script}.py --resume {folder}")
+    for model in [run.folder / "model.pt"] if args.save_model else checkpoints:
+        lines.append(f"evaluate: python evaluate.py {shlex.quote(str(model))}")
+        with contextlib.suppress(ValueError):
+            check_draws("enjoy.py", args.env_id)
+            lines.append(f"watch: python enjoy.py {shlex.quote(str(model))} --out page.html")
+    return "\n".join([*lines, f"plot: tensorboard --logdir {folder}"])
 
 
 def close(run: Run) -> None:
-    """Close all files, environments and connections."""
-    for each in filter(None, (run.bar, run.envs, run.eval_envs, run.writer)):
-        with contextlib.suppress(OSError):  # that a file cannot be written was reported before
-            each.close()
-    if run.lock is not None:
-        run.lock.release()
-    leave_processes()
+    """Close all files, environments and connections, the others too if one raises."""
+    with contextlib.ExitStack() as stack:  # from the last to the first
+        stack.callback(leave_processes)
+        stack.enter_context(contextlib.suppress(OSError))  # that a file cannot be written was reported before
+        for each in filter(None, (run.lock, run.writer, run.envs, run.eval_envs, run.bar)):
+            stack.callback(each.close)
 
 
 def command(
     kind: type[T], presets: dict[str, dict[str, Any]], setup: Callable[[T], Run], train: Callable[[T, Run], None]
 ) -> None:
-    """Train as the command line says, and exit: with one line for an error that a user can mend."""
+    """Train as the command line says, and exit: with one line for an error that a user can correct."""
 
-    def fail(error: Exception) -> None:
+    def fail(error: Exception) -> NoReturn:
         sys.exit(f"{Path(sys.argv[0]).name}: {' '.join(str(error).split())}")
 
     try:

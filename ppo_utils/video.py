@@ -20,7 +20,7 @@ class LaneVideo(Saved, RecordVideo):
 
     env: has been reset; its present episode is number 0. folder: is made if it is not there.
     A video shows every observation that was acted on, up to the first 1,000. What is being recorded is written by
-    close(). Its state is the number of the episode alone.
+    close(). Its state is the numbers of the episode and the step.
     """
 
     kept = ("episode_id", "step_id")
@@ -35,19 +35,19 @@ class LaneVideo(Saved, RecordVideo):
         self._capture_frame()
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Takes over the number of the episode, of which the beginning is missing: it has no video."""
+        """Take over the number of the episode, of which the beginning is missing: it has no video."""
         super().set_state(state)
         self.recording, self.recorded_frames = False, []
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], Any, Any, Any, dict[str, Any]]:
-        """One step of every lane; a video that is long enough ends here."""
+        """Step every lane; a video that is long enough ends here."""
         result = super().step(actions)
         if self.recording and len(self.recorded_frames) >= MAX_VIDEO_FRAMES:
             self.stop_recording()
         return result
 
     def _capture_frame(self) -> None:
-        """Keep lane 0's picture; Gymnasium's own method has all lanes draw theirs, 32 times the work."""
+        """Keep lane 0's picture; Gymnasium's own method has all lanes draw theirs."""
         envs = self.unwrapped
         if isinstance(envs, MemoryGymVectorEnv):
             (picture,) = envs.render(np.zeros(1, np.intp))

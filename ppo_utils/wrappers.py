@@ -3,7 +3,7 @@
 They take any vector environment with same-step autoreset. Gymnasium's (1.4) own vector wrappers of observations refuse
 those, and it has no frame stack for vector environments at all.
 Shape letters: N lanes, n some of them, H and W of a picture, K frames of a stack, D width of an encoding, V of a
-vector, A action branches.
+vector, F frequencies, A action branches.
 """
 
 import math
@@ -59,21 +59,21 @@ class SameStepWrapper(Saved, VectorWrapper):
     # ---- what a wrapper provides ----
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
-        """Starts new episodes in the lanes, (n,), with their first observations. seeds: one for every lane of N."""
+        """Start new episodes in the lanes, (n,), with their first observations. seeds: one for every lane of N."""
         raise NotImplementedError
 
     def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
-        """Takes in a step of all lanes and what they observe after it, before any reset."""
+        """Take in a step of all lanes and what they observe after it, before any reset."""
         raise NotImplementedError
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
-        """The lanes' observations, wrapped: fresh arrays where anything differs."""
+        """Return the lanes' observations, wrapped: fresh arrays where anything differs."""
         raise NotImplementedError
 
     # ---- Gymnasium's interface ----
 
     def reset(self, *, seed: Any = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts new episodes; arguments and errors are the environment's."""
+        """Start new episodes; arguments and errors are the environment's."""
         # Read before, since Gymnasium's own vector environments take it out.
         mask = options.get("reset_mask") if isinstance(options, Mapping) else None
         seeds = lane_seeds(seed, self.num_envs)
@@ -83,7 +83,7 @@ class SameStepWrapper(Saved, VectorWrapper):
         return self.wrap(observations, ALL), infos
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One step of every lane, its observations wrapped, those in `final_obs` too."""
+        """Step every lane, its observations wrapped, those in `final_obs` too."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         (ended,) = (terminated | truncated).nonzero()
         first = _rows(observations, ended)
@@ -131,11 +131,11 @@ class PictureWrapper(SameStepWrapper):
         self.picture_shape = parts[self.part].shape  # (H, W, channels)
 
     def picture(self, observations: Any) -> np.ndarray:
-        """The pictures of the observations, (n, H, W, channels)."""
+        """Return the pictures of the observations, (n, H, W, channels)."""
         return named(observations)[self.part]
 
     def replaced(self, whole: Any, picture: Any) -> Any:
-        """Observations, or their space, with another picture."""
+        """Return observations, or their space, with another picture."""
         return {**named(whole), self.part: picture} if isinstance(whole, (dict, gym.spaces.Dict)) else picture
 
     def _is_picture(self, space: gym.Space) -> bool:
@@ -165,7 +165,7 @@ class GrayscaleStack(PictureWrapper):
         self._set_space(gym.spaces.Dict(space) if isinstance(space, dict) else space)
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
-        """Fills the lanes' stacks with their first frame."""
+        """Fill the lanes' stacks with their first frame."""
         self._stack[lanes] = gray(self.picture(observations))[..., None]
 
     def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
@@ -176,7 +176,7 @@ class GrayscaleStack(PictureWrapper):
         self._stack[..., -1] = gray(self.picture(observations))
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
-        """The lanes' observations, with a copy of their stacks."""
+        """Return the lanes' observations, with a copy of their stacks."""
         return self.replaced(observations, self._stack[lanes].copy())
 
 
@@ -208,7 +208,7 @@ class VectorStack(SameStepWrapper):
         self._set_space(gym.spaces.Dict(stacked) if isinstance(space, gym.spaces.Dict) else stacked[OBSERVATION])
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
-        """Fills the lanes' stacks with their first vector."""
+        """Fill the lanes' stacks with their first vector."""
         for name, vectors in named(observations).items():
             self._stacks[name][lanes] = vectors[:, None]
 
@@ -220,7 +220,7 @@ class VectorStack(SameStepWrapper):
             stack[:, -1] = vectors
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
-        """A copy of the lanes' stacks."""
+        """Return a copy of the lanes' stacks."""
         stacks = {name: np.array(each[lanes]) for name, each in self._stacks.items()}  # (n, K, V)
         flat = {name: each.reshape(len(each), -1) for name, each in stacks.items()}  # (n, K * V)
         return flat if isinstance(observations, dict) else flat[OBSERVATION]
@@ -252,11 +252,11 @@ class StepEncoding(SameStepWrapper):
         self._steps[lanes] = 0
 
     def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
-        """Counts a step."""
+        """Count a step."""
         self._steps += 1
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
-        """The lanes' observations with their step numbers' encodings, (n, D)."""
+        """Return the lanes' observations with their step numbers' encodings, (n, D)."""
         return {**named(observations), STEP_ENCODING: sinusoidal(self._steps[lanes], self.width)}
 
 
@@ -282,28 +282,28 @@ class LastAction(SameStepWrapper):
         self._add_part(LAST_ACTION, gym.spaces.Box(low, high, dtype=np.float32))
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
-        """Forgets the lanes' actions."""
+        """Forget the lanes' actions."""
         self._last[lanes] = 0.0
 
     def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
-        """Keeps the step's action and reward."""
+        """Keep the step's action and reward."""
         choices = actions.reshape(self.num_envs, -1) - self.env.single_action_space.start  # (N, A)
         self._last[:, :-1] = one_hot(choices, self._branches)
         self._last[:, -1] = rewards
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
-        """The lanes' observations with a copy of their last actions."""
+        """Return the lanes' observations with a copy of their last actions."""
         return {**named(observations), LAST_ACTION: np.array(self._last[lanes])}
 
 
 class FourierFeatures(SameStepWrapper):
-    """Sines and cosines of all vectors at pi, 2 pi, 4 pi ..., beside the vectors, whose entries are best from 0 to 1.
+    """Sines and cosines of all vectors, whose entries should lie between 0 and 1, at pi, 2 pi, 4 pi ... beside them.
 
     They magnify small differences, so that a network learns sooner to tell values apart (Tancik et al., 2020).
 
-    frequencies: K.
+    frequencies: F.
     Observation: Dict of the environment's own parts, or `observation` if it is no Dict, then `sines` and `cosines`, Box
-    (V K,) float32 each, V entries of all vectors together.
+    (V F,) float32 each, V entries of all vectors together.
 
     Raises ValueError for an environment without same-step autoreset or vector, or with parts of these names.
     """
@@ -311,34 +311,38 @@ class FourierFeatures(SameStepWrapper):
     def __init__(self, env: VectorEnv, frequencies: int):
         super().__init__(env)
         self.arguments = {"frequencies": frequencies}
-        self._angles = np.float32(math.pi) * 2.0 ** np.arange(frequencies, dtype=np.float32)  # (K,) of an entry of 1
+        self._angles = np.float32(math.pi) * 2.0 ** np.arange(frequencies, dtype=np.float32)  # (F,) of an entry of 1
         parts = named(env.single_observation_space)
         self._vectors = [name for name, part in parts.items() if len(part.shape) == 1]
-        if not self._vectors or {SINES, COSINES} & parts.keys():
-            raise ValueError(f"FourierFeatures needs a vector to observe, and to add features, not {parts}")
+        if not self._vectors:
+            raise ValueError(f"FourierFeatures needs an observation with a vector, not with {', '.join(parts)} alone")
+        if taken := {SINES, COSINES} & parts.keys():
+            raise ValueError(
+                f"FourierFeatures adds {SINES} and {COSINES}, but the observation has {min(taken)} already"
+            )
         entries = sum(parts[name].shape[0] for name in self._vectors)
         features = gym.spaces.Box(-1.0, 1.0, (entries * frequencies,), np.float32)
         self._set_space(gym.spaces.Dict({**parts, SINES: features, COSINES: features}, sort_keys=False))
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
-        """Nothing: features depend on the present observation alone."""
+        """Do nothing: features depend only on the present observation."""
 
     def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
-        """Nothing, too."""
+        """Do nothing."""
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
-        """The lanes' observations with the features of their vectors."""
+        """Return the lanes' observations with the features of their vectors."""
         vectors = np.concatenate([named(observations)[name] for name in self._vectors], axis=1, dtype=np.float32)
-        angles = (vectors[..., None] * self._angles).reshape(len(vectors), -1)  # (n, V K)
+        angles = (vectors[..., None] * self._angles).reshape(len(vectors), -1)  # (n, V F)
         return {**named(observations), SINES: np.sin(angles), COSINES: np.cos(angles)}
 
 
 class SpotlightPerturbation(PictureWrapper):
-    """A veil over the picture in which spotlights leave holes, wandering as in Searing Spotlights (thesis 7.2).
+    """A translucent layer over the picture with moving holes, the spotlights of Searing Spotlights (thesis 7.2).
 
-    The defaults are those of the author's code (neroRL): a white veil of opacity 120, and spotlights that have gone
-    30 % of their way when an episode begins, so that the first observation is perturbed too. The light is that of a
-    Searing Spotlights environment that nobody plays; it changes nothing but the picture.
+    The defaults are those of the author's code (neroRL): a white layer of opacity 120, and spotlights that have gone
+    30 % of their way when an episode begins, so that the first observation is perturbed too. A Searing Spotlights
+    environment, which gets no actions from the agent, computes them; they change nothing but the picture.
 
     env: pictures must be 84 x 84. opacity: of the veil, of 255. shade: its gray level, 255 white, 0 black.
     lights: any of the Searing Spotlights options in LIGHTS. With the default ones no spotlight appears after step 1,200
@@ -366,15 +370,15 @@ class SpotlightPerturbation(PictureWrapper):
         self._radii = int(least), int(max(least, largest))
 
     def get_state(self) -> dict[str, Any]:
-        """The state of the light in plain values: its spotlights, and the lanes' generators for them."""
+        """Return the state of the light in plain values: its spotlights, and the lanes' generators for them."""
         return self._light.get_state()
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Takes over a copy of what get_state() returned."""
+        """Take over a copy of what get_state() returned."""
         self._light.set_state(state)
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
-        """Samples the first spotlights of the lanes' episodes."""
+        """Sample the first spotlights of the lanes' episodes."""
         for lane in lanes.tolist():
             if seeds[lane] is not None:
                 stream = np.random.SeedSequence(seeds[lane], spawn_key=(SPOT_STREAM,))
@@ -386,11 +390,11 @@ class SpotlightPerturbation(PictureWrapper):
         s.spots[TIME, lanes] += s.spots[SPEED, lanes]
 
     def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
-        """Moves the spotlights on."""
+        """Move the spotlights on."""
         self._light.advance(np.zeros((self.num_envs, 2), np.int64))
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
-        """The lanes' observations, with the veil wherever no spotlight is."""
+        """Return the lanes' observations, with the veil wherever no spotlight is."""
         frames = self.picture(observations).reshape(-1, FRAME)  # (n, FRAME)
         bits, _ = light_masks(self._light.state, spot_stencils(*self._radii), lanes)
         veiled = frames * self.clear
@@ -405,14 +409,14 @@ class SpotlightPerturbation(PictureWrapper):
 
 
 def named(observation: Any) -> dict[str, Any]:
-    """An observation, or its space, as parts by name: those of a dict, or its only one."""
+    """Return an observation, or its space, as parts by name: those of a dict, or its only one."""
     if isinstance(observation, gym.spaces.Dict):
         return observation.spaces
     return observation if isinstance(observation, dict) else {OBSERVATION: observation}
 
 
 def branch_sizes(space: gym.Space) -> np.ndarray:
-    """The number of actions of each branch, (A,); raises ValueError for other than Discrete and MultiDiscrete."""
+    """Return the number of actions of each branch, (A,); raise ValueError unless Discrete or MultiDiscrete."""
     if isinstance(space, gym.spaces.Discrete):
         return np.array([space.n])
     if isinstance(space, gym.spaces.MultiDiscrete) and space.nvec.ndim == 1:
@@ -421,42 +425,42 @@ def branch_sizes(space: gym.Space) -> np.ndarray:
 
 
 def one_hot(choices: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Choices (n, A) from 0 to sizes - 1, each one-hot, side by side: (n, sum of the sizes) float32."""
+    """Return choices (n, A) from 0 to sizes - 1, each one-hot, side by side: (n, sum of the sizes) float32."""
     found = np.zeros((len(choices), sizes.sum()), np.float32)
     found[np.arange(len(choices))[:, None], choices + (np.cumsum(sizes) - sizes)] = 1.0
     return found
 
 
 def gray(frames: np.ndarray) -> np.ndarray:
-    """Pictures (..., 3) or (..., 1) uint8 in grayscale, (...) uint8, rounded to the nearest."""
+    """Return pictures (..., 3) or (..., 1) uint8 in grayscale, (...) uint8, rounded to the nearest."""
     if frames.shape[-1] == 1:
         return frames[..., 0]
     return (frames @ LUMA + np.float32(0.5)).astype(np.uint8)
 
 
 def stack_size(frames: int) -> int:
-    """The number of frames of a stack; raises ValueError unless it is an integer of at least 1."""
+    """Return the number of frames of a stack; raises ValueError unless it is an integer of at least 1."""
     if not isinstance(frames, (int, np.integer)) or frames < 1:
         raise ValueError(f"frames must be an integer of at least 1, not {frames!r}")
     return int(frames)
 
 
 def sinusoidal(positions: np.ndarray, width: int) -> np.ndarray:
-    """The transformer's encoding of positions (n,), (n, width) float32: (2.57) at even, (2.58) at odd places."""
+    """Return the transformer's encoding of positions (n,), (n, width) float32: (2.57) at even, (2.58) at odd places."""
     rates = 10000.0 ** -(np.arange(0, width, 2) / width)  # (width / 2,)
     angles = positions[:, None] * rates
     return np.stack([np.sin(angles), np.cos(angles)], axis=2).reshape(-1, width).astype(np.float32)
 
 
 def _rows(observations: Any, lanes: np.ndarray) -> Any:
-    """Copies of the lanes' observations."""
+    """Return copies of the lanes' observations."""
     if isinstance(observations, dict):
         return {key: values[lanes] for key, values in observations.items()}
     return observations[lanes]
 
 
 def _batched(observations: np.ndarray) -> Any:
-    """Single observations, (n,) objects, as one batch."""
+    """Return single observations, (n,) objects, as one batch."""
     if isinstance(observations[0], dict):
         return {key: np.stack([each[key] for each in observations]) for key in observations[0]}
     return np.stack(list(observations))

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 import ppo_gru
 import ppo_trxl
-from ppo_gru import Agent, Args, Decoder, reconstruction_loss
+from ppo_gru import Agent, Args, Decoder
 from ppo_utils.checkpoints import read_model
 from ppo_utils.environments import envs_for
 
@@ -22,7 +22,7 @@ PROBES = pytest.mark.parametrize(("name", "part"), [("ground_truth", "estimator"
 
 def loss_of(script, args, run):
     """The loss of a whole rollout, its logs, and the gradients that it leaves."""
-    pieces = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated)
+    pieces = run.agent.memory.cut(run.rollout.done)
     run.rollout.advantages.zero_()
     run.rollout.returns.zero_()
     run.agent.zero_grad()
@@ -48,24 +48,17 @@ def test_the_decoder_is_the_transposed_encoder():
     assert sizes == [(64, 7, 7), (64, 9, 9), (32, 20, 20), (3, 84, 84)]
 
 
-def test_reconstruction_loss_by_hand():
-    pixels = torch.tensor([[0, 255, 51]], dtype=torch.uint8)
-    drawn = torch.tensor([[0.5, 0.9, 0.2]])
-    entropy = -np.log(0.5) - np.log(0.9) - 0.2 * np.log(0.2) - 0.8 * np.log(0.8)
-    assert reconstruction_loss(torch.logit(drawn), pixels) == pytest.approx(entropy / 3, rel=1e-6)
-
-
 @SCRIPTS
 def test_the_losses_are_means_over_real_steps(played, script):
     args, run, *_ = played(script=script, env_id="MortarMayhemB-Grid-v0", **HEADS)
     loss, logs, _ = loss_of(script, args, run)
-    pieces = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated)
+    pieces = run.agent.memory.cut(run.rollout.done)
     order = pieces.flat_index()
     assert sorted(order.tolist()) == list(range(64))  # every step once, no padding
     obs = {name: part.flatten(0, 1)[order] for name, part in run.rollout.obs.items()}
     with torch.no_grad():
         actions = run.rollout.actions.flatten(0, 1)[order]
-        features = run.agent.evaluate_actions(run.agent.encoder(obs), actions, pieces, run.rollout.memory)[3]
+        features = run.agent.evaluate_actions(run.agent.encoder(obs), actions, pieces, run.rollout.memory_state)[3]
         drawn = torch.sigmoid(run.agent.decoder(features))
         wanted = obs["visual_observation"] / 255
         truths = run.rollout.ground_truth.flatten(0, 1)[order]

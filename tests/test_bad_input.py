@@ -1,5 +1,6 @@
 """Bad input ends in one line that says what is wrong and what would be right, and writes nothing."""
 
+import errno
 import glob
 import os
 import re
@@ -28,12 +29,13 @@ CASES = {
     "--env-id nowhere:Env-v0": "nowhere",
     "--env-id Pendulum-v1": "action space .* is not supported; use Discrete",
     "--env-options {broken": "--env-options is no JSON",
+    f"--env-options {5000 * '['}": "--env-options is no JSON",
     "--env-options [1]": "--env-options must be a JSON object",
     '--env-options {"comand_count":[3]}': "comand_count.*command_count",
     '--env-options {"arena_size":9}': "arena_size.*2.*6",
     '--env-id CartPole-v1 --env-options {"a":1}': "CartPole-v1 has none",
     "--num-envs 0": "--num-envs is 0; it must be 1 or more",
-    "--vector-frequencies 4": "--vector-frequencies: FourierFeatures needs a vector to observe",
+    "--vector-frequencies 4": "needs an observation with a vector, not with observation alone",
     "--vector-frequencies 17": "--vector-frequencies is 17; it must be 0 to 16",
     "--gamma 1.5": "--gamma is 1.5; it must be 0 to 1",
     "--init-lr nan": "--init-lr is nan; it must be 0 to 1",
@@ -132,11 +134,12 @@ def test_infinity_is_no_limit(tiny):
     check_args(tiny(max_grad_norm=float("inf"), clip_coef=float("inf"), target_kl=float("inf")))
 
 
-def test_a_file_system_without_locks(tiny, opened, monkeypatch):
-    def acquire(*_, **__):
-        raise NotImplementedError("FileSystem does not appear to support flock")
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL])
+def test_a_file_system_without_locks(tiny, opened, monkeypatch, number):
+    def flock(*_):
+        raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(runs.FileLock, "acquire", acquire)
+    monkeypatch.setattr(runs.fcntl, "flock", flock)
     assert opened(ppo_gru, tiny(env_id="CueRecall-v0")).folder.is_dir()
 
 

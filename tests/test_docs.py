@@ -263,7 +263,7 @@ def test_readme_names_the_memory_interface(script):
         called = script.Memory.__init__ if name == "Memory" else getattr(script.Memory, name)
         named = parameters.split(", ")
         parameters = [name for name in inspect.signature(called).parameters if name != "self"]
-        assert parameters == ["state", "hidden"] if name == "store" else parameters == named
+        assert parameters == ["state", "hidden"] if name == "advance" else parameters == named
 
 
 def test_page_names_the_curves(tiny, scalars):

@@ -371,10 +371,11 @@ def test_the_arguments_of_a_run_of_another_script():
 
 
 def test_a_model_of_another_script():
-    torch.save({"script": "ppo_other", "args": {}, "weights": {}}, "model.pt")
-    for read in (evaluate.Checkpoint.read, enjoy.load):
-        with pytest.raises(ValueError, match=r"model\.pt was trained by ppo_other\.py, which is not here; run this be"):
-            read("model.pt")
+    for name in ("ppo_other", "ppo_utils"):
+        torch.save({"script": name, "args": {}, "weights": {}}, "model.pt")
+        for read in (evaluate.Checkpoint.read, enjoy.load):
+            with pytest.raises(ValueError, match=rf"model\.pt was trained by {name}\.py, which is not here; run"):
+                read("model.pt")
 
 
 def test_a_file_names_no_other_module():

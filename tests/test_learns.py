@@ -22,14 +22,14 @@ def trained(monkeypatch):
     """
 
     def train(script, args):
-        report, returns = script.report, []
+        end_iteration, returns = script.end_iteration, []
 
-        def report_and_stop(args, run, logs, episodes):
+        def end_or_stop(args, run, logs, episodes):
             returns.append(np.mean(episodes["charts/episodic_return"]))
-            report(args, run, logs, episodes)
+            end_iteration(args, run, logs, episodes)
             run.stop |= len(returns) >= 5 and np.mean(returns[-5:]) >= 0.95
 
-        monkeypatch.setattr(script, "report", report_and_stop)
+        monkeypatch.setattr(script, "end_iteration", end_or_stop)
         script.main(args)
         return np.mean(returns[-5:])
 

@@ -46,11 +46,11 @@ def each_memory(memories):
 def recompute(run):
     """Evaluate the whole rollout in one batch of pieces; return the pieces' steps, ratios and values."""
     rollout = run.rollout
-    pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
+    pieces = run.agent.memory.cut(rollout.done)
     index = pieces.flat_index()
     x = run.agent.encoder({name: part.flatten(0, 1)[index] for name, part in rollout.obs.items()})
     actions = rollout.actions.flatten(0, 1)[index]
-    _, log_probs, values, _ = run.agent.evaluate_actions(x, actions, pieces, rollout.memory)
+    _, log_probs, values, _ = run.agent.evaluate_actions(x, actions, pieces, rollout.memory_state)
     return index, (log_probs - rollout.log_probs.flatten(0, 1)[index]).exp(), values
 
 
@@ -90,7 +90,7 @@ def test_ratio_is_nearly_one_in_bfloat16(played, memory):
 def test_ratio_error_sees_a_broken_memory(played, memory):
     """Guards the guard: with what the memory stored lost, the ratios are off."""
     _, run, *_ = played(iterations=3, weights_scale=3.0, env_id="CueRecall-v0", **memory)
-    for part in vars(run.rollout.memory).values():
+    for part in vars(run.rollout.memory_state).values():
         if isinstance(part, torch.Tensor) and part.is_floating_point():
             part.zero_()
     assert (recompute(run)[1] - 1).abs().max() > 1e-4
@@ -108,7 +108,7 @@ def test_an_episode_begins_with_an_empty_memory(played, memory):
     rollout = played(env_id="CueRecall-v0", **memory)[1].rollout
     begins = rollout.terminated[:-1]
     assert begins.any()
-    stored = rollout.memory.stored
+    stored = rollout.memory_state.stored
     assert (stored[1:][begins] == 0).all()
     assert stored[1:][~begins].flatten(1).any(1).all(), "and goes on where none ended"
     assert (stored[0] == 0).all()
@@ -134,7 +134,7 @@ def test_padding_changes_nothing(played, memory, fill, monkeypatch):
     rollout.advantages, rollout.returns = rollout.rewards - rollout.values, rollout.rewards
 
     def learn():
-        pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
+        pieces = run.agent.memory.cut(rollout.done)
         assert pieces.length.min() < pieces.length.max(), "there is padding"
         run.agent.zero_grad()
         loss, _ = script.ppo_loss(run.agent, rollout, pieces, 1e-3, args)
@@ -163,7 +163,7 @@ def test_no_gradient_crosses_the_end_of_an_episode(played, memory):
     begins = done[:-1].flatten().nonzero()[:, 0] + pieces.num_envs  # flat indices
     assert torch.isin(begins, pieces.first).all(), "a piece begins where an episode begins"
     x = torch.randn(int(pieces.length.sum()), run.agent.encoder.width, requires_grad=True)
-    y = run.agent.memory.unroll(rollout.memory, x, pieces)
+    y = run.agent.memory.unroll(rollout.memory_state, x, pieces)
     ends = pieces.length.cumsum(0)
     piece = int((pieces.length > 2).nonzero()[1, 0])
     first, last = int(ends[piece] - pieces.length[piece]), int(ends[piece] - 1)
@@ -189,7 +189,7 @@ def test_gru_equals_a_loop_over_cells():
 @each_memory(WITH_MEMORY)
 def test_an_episode_s_first_step_is_the_same_whatever_came_before(played, memory):
     _, run, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
-    agent, state = run.agent, run.rollout.memory
+    agent, state = run.agent, run.rollout.memory_state
     obs = {"observation": torch.randn(4, 3)}
     with torch.no_grad():
         fresh = agent.get_value(obs, agent.memory.initial_state(4, 16, torch.device("cpu")))
@@ -226,7 +226,7 @@ def test_equal_observations_are_encoded_once(played, env_id):
     distinct = len(rollout.first_occurrence.unique())
     assert distinct < 0.6 * len(rollout.first_occurrence)
     run.agent.encoder.register_forward_pre_hook(lambda _, inputs: rows.append(len(next(iter(inputs[0].values())))))
-    pieces = run.agent.memory.cut(rollout.terminated | rollout.truncated)
+    pieces = run.agent.memory.cut(rollout.done)
     rollout.advantages, rollout.returns, found = *(2 * (torch.randn(32, 4),)), []
     for _ in range(2):
         run.agent.zero_grad()
@@ -253,7 +253,7 @@ def test_a_long_episode_takes_no_more_memory_than_a_short_one(played):
         ppo_gru.collect(run.agent, run.envs, run.rollout, args)
     assert run.envs.episode_lengths[0] > 900
     assert storage() == before
-    assert run.rollout.memory.hidden.shape == (1, 1, 4)
+    assert run.rollout.memory_state.hidden.shape == (1, 1, 4)
 
 
 def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(played):
@@ -261,17 +261,17 @@ def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(pl
     changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"explosion_delay": [1000]}'}
     args, run, *_ = played(script=ppo_trxl, num_envs=1, num_steps=50, num_minibatches=1, **changes)
     # As if the episode had been going on for long; its window is still that of 50 steps.
-    run.rollout.memory.episode_step.add_(4050)
+    run.rollout.memory_state.episode_step.add_(4050)
 
     def storage():
-        state = run.rollout.memory
-        return [(part.data_ptr(), part.shape) for part in (state.keys, state.values, state.hidden, state.stored_step)]
+        state = run.rollout.memory_state
+        return [(part.data_ptr(), part.shape) for part in (state.keys, state.values, state.hidden, state.row_step)]
 
     before = storage()
     for _ in range(19):
         ppo_trxl.collect(run.agent, run.envs, run.rollout, args)
         assert recompute(run)[1].sub(1).abs().max() < 1e-5
-    assert run.rollout.memory.episode_step > 5000
+    assert run.rollout.memory_state.episode_step > 5000
     assert storage() == before
 
 
@@ -294,6 +294,22 @@ def test_truncation_bootstraps_with_the_final_observation_and_the_memory_before_
         value = run.agent.get_value(final, state)
     torch.testing.assert_close(rollout.truncation_values[4], value, atol=1e-6, rtol=0)
     assert (played(**changes)[1].rollout.truncation_values == 0).all()
+
+
+def test_a_step_that_terminated_its_episode_is_not_bootstrapped(tiny, opened, monkeypatch):
+    changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"max_steps": 5}', "num_envs": 2, "seed": 3}
+    args = tiny(bootstrap_truncated=True, **changes)
+    run = opened(ppo_gru, args)
+    step = run.envs.step
+
+    def terminate_too(actions):
+        obs, rewards, _, truncated, infos = step(actions)
+        return obs, rewards, truncated & [True, False], truncated, infos
+
+    monkeypatch.setattr(run.envs, "step", terminate_too)
+    ppo_gru.collect(run.agent, run.envs, run.rollout, args)
+    assert run.rollout.truncated[4].all()
+    assert (run.rollout.truncation_values[4] != 0).tolist() == [False, True]
 
 
 def test_training_hands_the_rollout_to_gae(tiny, opened, monkeypatch):
@@ -358,15 +374,15 @@ def test_acting_and_learning_ask_no_device_for_numbers(played, monkeypatch, memo
     script = memory.get("script", ppo_gru)
     args, run, *_ = played(env_id="MortarMayhemB-Grid-v0", iterations=2, **heads, **memory)
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())  # knows no such device
-    pieces, agent = run.agent.memory.cut(run.rollout.terminated | run.rollout.truncated), run.agent.to("meta")
-    on_cpu = {"episode_step", "stored_step"}  # of the transformer's memory: what shapes depend on
+    pieces, agent = run.agent.memory.cut(run.rollout.done), run.agent.to("meta")
+    on_cpu = {"episode_step", "row_step"}  # of the transformer's memory: what shapes depend on
 
     def moved(parts):
         return {k: v.to("meta") if isinstance(v, torch.Tensor) and k not in on_cpu else v for k, v in parts.items()}
 
     rollout = run.rollout
-    memory = type(rollout.memory)(**moved(vars(rollout.memory)))
-    rollout = script.Rollout(**moved(vars(rollout)) | {"obs": moved(rollout.obs), "memory": memory})
+    memory = type(rollout.memory_state)(**moved(vars(rollout.memory_state)))
+    rollout = script.Rollout(**moved(vars(rollout)) | {"obs": moved(rollout.obs), "memory_state": memory})
     obs = {name: part[0] for name, part in rollout.obs.items()}
     with NoQuestions(), torch.no_grad():
         agent.memory.begin_rollout(memory, agent.memory.carry(memory))
@@ -395,9 +411,9 @@ REFRESHED = {
 def test_refreshing_with_the_weights_that_acted_changes_nothing(played, ends, memory):
     args, run, *_ = played(iterations=3, **REFRESHED[ends], **memory)
     assert ends == "neither" or getattr(run.rollout, ends).any()
-    before = copy.deepcopy(vars(run.rollout.memory))
+    before = copy.deepcopy(vars(run.rollout.memory_state))
     memory.get("script", ppo_gru).refresh_memory(run.agent, run.rollout, args)
-    for name, now in vars(run.rollout.memory).items():
+    for name, now in vars(run.rollout.memory_state).items():
         same = torch.equal(before[name], now) if isinstance(now, torch.Tensor) else before[name] == now
         assert same, f"{name}: does carry hold all that a rollout begins with?"
 
@@ -408,7 +424,7 @@ def test_a_refreshed_memory_is_that_of_a_rollout_with_the_present_weights(played
     script = memory.get("script", ppo_gru)
     args, run, *_ = played(iterations=3, weights_scale=3.0, env_id="CueRecall-v0", **memory)
     rollout, agent = run.rollout, run.agent
-    state = copy.deepcopy(rollout.memory)
+    state = copy.deepcopy(rollout.memory_state)
     with torch.no_grad():
         for parameter in agent.parameters():
             parameter.mul_(0.9)
@@ -417,7 +433,7 @@ def test_a_refreshed_memory_is_that_of_a_rollout_with_the_present_weights(played
     assert not torch.allclose(ratio, torch.ones(()), atol=1e-4), "the policy is another one"
     # Steps one by one, from what was stored before the rollout.
     with torch.no_grad():
-        agent.memory.begin_rollout(state, rollout.carry)
+        agent.memory.begin_rollout(state, rollout.initial_memory)
         wanted = []
         for t in range(args.num_steps):
             _, _, value = agent.get_action_and_value({name: part[t] for name, part in rollout.obs.items()}, state)

@@ -18,7 +18,7 @@ from conftest import parse_args
 
 import ppo_gru
 import ppo_trxl
-from ppo_utils import processes, runs
+from ppo_utils import environments, processes
 from ppo_utils.checkpoints import read_checkpoint, read_model
 
 SCRIPTS = [ppo_gru, ppo_trxl]
@@ -41,8 +41,8 @@ for name, args, weights, rollout in torch.load("given.pt", weights_only=False):
         if isinstance(stored, torch.Tensor):
             setattr(run.rollout, name, stored[:, lanes])
     run.rollout.obs = {name: part[:, lanes] for name, part in rollout["obs"].items()}
-    for name in ("stored",) if script.__name__ == "ppo_gru" else ("hidden", "stored_step"):
-        setattr(run.rollout.memory, name, getattr(rollout["memory"], name)[:, lanes])
+    for name in ("stored",) if script.__name__ == "ppo_gru" else ("hidden", "row_step"):
+        setattr(run.rollout.memory_state, name, getattr(rollout["memory_state"], name)[:, lanes])
     optimizer = torch.optim.SGD(run.agent.parameters(), lr=1.0)
     logs = script.mean_logs(script.update(run.agent, optimizer, run.rollout, 0.01, args), run.rollout)
     updated.append((run.agent.state_dict(), logs))
@@ -135,10 +135,10 @@ print([name for task in Path("/proc/self/task").iterdir() if "gloo" in (name := 
 
 def test_processes_play_shares_of_the_lanes_of_one(tiny, monkeypatch):
     args = tiny(env_id="MortarMayhem-v0", num_levels=0)
-    alone, seeds = runs.training_envs(args, None), []
+    alone, seeds = environments.training_envs(args, None), []
     for rank in (0, 1):
-        monkeypatch.setattr(runs, "rank_and_size", lambda rank=rank: (rank, 2))
-        seeds += runs.training_envs(args, None).np_random_seed
+        monkeypatch.setattr(environments, "rank_and_size", lambda rank=rank: (rank, 2))
+        seeds += environments.training_envs(args, None).np_random_seed
     assert len({*seeds}) == 4
     assert seeds == list(alone.np_random_seed)
 

@@ -1,5 +1,6 @@
 """A run that stops and goes on gives, to the last bit, the curves of the run that never stopped."""
 
+import dataclasses
 import errno
 import itertools
 import os
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 from pathlib import Path
 
 import numpy as np
@@ -211,7 +213,7 @@ def test_environments_of_other_packages_begin_new_episodes(tiny, opened, curves,
     first = opened(ppo_gru, tiny(env_id="CartPole-v1", exp_name="first"))
     for name, part in run.rollout.next_obs.items():
         assert not (part == first.rollout.next_obs[name]).all(axis=1).any(), "not the episodes that it began with"
-    assert not run.rollout.memory.hidden.any()
+    assert not run.rollout.memory_state.hidden.any()
     runs.run_to_end(args, run, ppo_gru.train)
     assert [step for step, _ in curves(folder)["losses/loss"]] == [64, 128, 192, 256, 320]
 
@@ -262,7 +264,7 @@ def test_a_checkpoint_holds_what_the_next_rollout_begins_with(tiny):
     folder = ppo_trxl.main(tiny(ppo_trxl, **GRID, **changes))
     memory = read_checkpoint(folder)["processes"][0]["memory"]
     assert {name: tuple(part.shape) for name, part in memory.items()} == {
-        "hidden": (7, 4, 3, 32), "stored_step": (7, 4), "episode_step": (4,)
+        "hidden": (7, 4, 3, 32), "row_step": (7, 4), "episode_step": (4,)
     }  # fmt: skip
     folder = ppo_gru.main(tiny(**GRID, **changes))
     (hidden,) = read_checkpoint(folder)["processes"][0]["memory"].values()
@@ -386,8 +388,48 @@ def test_a_checkpoint_with_the_weights_in_another_order(trained):
     moments = saved["optimizer"]["state"]
     saved["optimizer"]["state"] = {i: moments[(i + 1) % len(moments)] for i in moments}
     torch.save(saved, path)
-    with pytest.raises(ValueError, match=r"of a version with the weights in another order, .*; --load-model takes"):
+    with pytest.raises(ValueError, match=r"is of an older version, .*; --load-model takes its weights"):
         resumed(ppo_gru, trained, "--total-timesteps", "256")
+
+
+def test_a_checkpoint_with_another_memory_s_state(tiny, tmp_path):
+    """As a transformer's was before: the whole rollout, by other names."""
+    folder = ppo_trxl.main(tiny(ppo_trxl, **GRID, capture_video=False))
+    path = folder / "checkpoint-128.pt"
+    saved = read_model(path)
+    memory = saved["processes"][0]["memory"]
+    saved["processes"][0]["memory"] = {"items": memory["hidden"], "episode_step": memory["episode_step"]}
+    torch.save(saved, path)
+    before = sorted(folder.iterdir())
+    with pytest.raises(ValueError, match=r"is of an older version, .*; --load-model takes its weights"):
+        resumed(ppo_trxl, folder, "--total-timesteps", "256")
+    assert sorted(folder.iterdir()) == before
+
+
+def test_flags_that_no_longer_exist(trained, capfd):
+    path = trained / "checkpoint-128.pt"
+    saved = read_model(path)
+    torch.save({**saved, "args": saved["args"] | {"eval_repeats": 5}}, path)
+    assert resumed(ppo_gru, trained) == trained
+    assert f"--resume {trained}: it goes on without --eval-repeats, which no longer exist" in capfd.readouterr().err
+
+
+def test_a_run_that_another_process_has_gone_on_with(trained, monkeypatch):
+    """Between reading the checkpoint and locking the folder."""
+    monkeypatch.setattr(runs, "read_checkpoint", lambda _: read_model(trained / "checkpoint-64.pt"))
+    with pytest.raises(OSError, match=r"another process has just gone on with this run; start again"):
+        ppo_gru.setup(parse_args(ppo_gru, "--resume", str(trained)))
+
+
+def test_tracking_waits_for_the_lock(tiny, opened, monkeypatch):
+    started = []
+    monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(init=lambda **given: started.append(given["id"])))
+    args = tiny(**GRID, total_timesteps=256, checkpoint_interval=1, track=True)
+    run = opened(ppo_gru, args)
+    ppo_gru.train(dataclasses.replace(args, total_timesteps=64), run)
+    with pytest.raises(OSError, match=r"--resume .*: another process is training this run"):
+        ppo_gru.setup(parse_args(ppo_gru, "--resume", str(run.folder)))
+    assert started == [run.folder.name]
 
 
 def test_weights_alone_are_no_checkpoint(trained):

@@ -136,8 +136,20 @@ def test_trains_on_vectors_and_their_frequencies(tiny, scalars):
 
 def test_flags_that_were_renamed(tiny):
     """An older file has them by their former names."""
-    saved = {"args": {"head_size": 7, "seed": 3, "no_longer": 1}}
-    assert saved_args(ppo_gru.Args, saved) == ppo_gru.Args(trunk_size=7, seed=3)
+    args = {"head_size": 7, "seed": 3, "no_longer": 1}
+    torch.save({"script": "ppo_gru", "args": args, "weights": {}}, "model.pt")
+    assert saved_args(ppo_gru.Args, read_model("model.pt")) == ppo_gru.Args(trunk_size=7, seed=3)
+
+
+def test_weights_that_were_renamed(tiny):
+    args = tiny(ppo_trxl, env_id="CueRecall-v0", total_timesteps=64, save_model=True)
+    path = ppo_trxl.main(args) / "model.pt"
+    saved = torch.load(path, weights_only=True)
+    weights = saved["weights"]
+    saved["weights"] = {name.replace(".norm_memory.", ".norm_items."): weight for name, weight in weights.items()}
+    assert saved["weights"].keys() != weights.keys()
+    torch.save(saved, path)
+    assert list(read_model(path)["weights"]) == list(weights)
 
 
 def test_logs_every_number_of_the_final_info(tiny, scalars):
@@ -367,9 +379,53 @@ def test_the_last_lines(tiny, capsys):
     score, *commands = capsys.readouterr().out.splitlines()
     assert re.fullmatch(rf"{folder}: 256 steps, return -?\d\.\d\d on 2 unseen levels", score)
     assert commands[0] == f"evaluate: python evaluate.py {folder / 'model.pt'}"
-    folder = ppo_gru.main(tiny(env_id="MysteryPath-v0", checkpoint_interval=0, exp_name="c"))
-    told = [f"{folder}: 128 steps, no episode ended", f"plot: tensorboard --logdir {folder}"]
+    folder = ppo_gru.main(tiny(env_id="MysteryPath-v0", checkpoint_interval=0, exp_name="c d"))
+    told = [f"{folder}: 128 steps, no episode ended", f"plot: tensorboard --logdir '{folder}'"]
     assert capsys.readouterr().out.splitlines() == told
+
+
+def test_the_last_lines_of_a_run_that_was_stopped(tiny, opened, capsys):
+    args = tiny(env_id="CueRecall-v0", total_timesteps=256, eval_interval=1)
+    run = opened(ppo_gru, args)
+    run.received_signal = 15
+    runs.run_to_end(args, run, ppo_gru.train)
+    told = capsys.readouterr().out.splitlines()
+    assert told[1:] == [
+        f"resume: python ppo_gru.py --resume {run.folder}",
+        f"evaluate: python evaluate.py {run.folder / 'checkpoint-64.pt'}",  # this environment draws nothing to watch
+        f"plot: tensorboard --logdir {run.folder}",
+    ]
+
+
+def test_a_terminal_that_is_gone(tiny, opened, monkeypatch):
+    """Ctrl-C ends `tee` too: the training still ends with its checkpoint."""
+    args = tiny(env_id="CueRecall-v0", total_timesteps=256)
+    run = opened(ppo_gru, args)
+
+    def gone(*_, **__):
+        raise BrokenPipeError
+
+    for owner, name in ((run.bar, "set_postfix"), (run.bar, "update"), (run.bar, "close"), (os, "write")):
+        monkeypatch.setattr(owner, name, gone)
+    handlers = {}
+    monkeypatch.setattr(runs.signal, "signal", handlers.__setitem__)
+    runs.stop_on_signals(run)
+    handlers[runs.signal.SIGINT](runs.signal.SIGINT, None)
+    assert (runs.run_to_end(args, run, ppo_gru.train) / "checkpoint-64.pt").is_file()
+
+
+def test_closing_goes_on_where_a_part_cannot_be_closed(tiny, opened, monkeypatch):
+    run = opened(ppo_gru, tiny(env_id="CueRecall-v0"))
+
+    def broken():
+        raise RuntimeError("the simulator is gone")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run.envs, "close", broken)
+        with pytest.raises(RuntimeError, match="the simulator is gone"):
+            runs.close(run)
+    assert run.lock.closed
+    assert run.writer.file_writer is None
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

@@ -499,5 +499,5 @@ def test_fourier_features_are_those_of_all_vectors():
 
 def test_fourier_features_without_a_vector():
     envs = gym.make_vec("MysteryPath-v0", num_envs=2)
-    with pytest.raises(ValueError, match="FourierFeatures needs a vector to observe"):
+    with pytest.raises(ValueError, match="needs an observation with a vector, not with observation alone"):
         FourierFeatures(envs, 2)
