@@ -126,7 +126,7 @@ def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, max_steps: int
         episode.rewards.append(float(rewards[0]))
         episode.finished = bool(terminated[0] or truncated[0])
     if episode.finished:
-        episode.final = {name: values.item() for name, _, values in final_numbers(infos, np.ones(1, bool))}
+        episode.final = {name: values.item() for name, values in final_numbers(infos, np.ones(1, bool)).items()}
     return episode
 
 

@@ -43,9 +43,10 @@ from tensorboard.util.tensor_util import make_ndarray
 from tqdm import tqdm
 
 from ppo_utils.checkpoints import RENAMED, import_script, load_weights, make_agent, read_model, saved_args
-from ppo_utils.environments import envs_for
+from ppo_utils.environments import envs_for, with_options
 from ppo_utils.evaluation import evaluate, evaluation_levels
 from ppo_utils.flags import flag
+from ppo_utils.processes import RunError
 
 try:
     from matplotlib import color_sequences
@@ -85,12 +86,18 @@ class Config:
     checkpoints: tyro.conf.Positional[tuple[str, ...]] = ()
     """model files: model.pt that --save-model wrote, or those that were written during training"""
     levels: int = 50
-    """levels to play, from start_level + num_levels on: those that follow the training levels (an agent that trained
-    without a limit, --num-levels 0, has met none of the numbered levels)"""
+    """levels to play"""
+    start_level: int | None = None
+    """the first of these levels (default: the first after those of the training; an agent that trained without a limit,
+    --num-levels 0, has met none of the numbered levels)"""
     repeats: int = 3
     """how often to play each level"""
     max_steps: int = 10_000
     """steps after which an endless episode is cut short"""
+    env_options: str | None = None
+    """reset options of a Memory Gym environment as JSON, over those of the training"""
+    deterministic: bool = False
+    """take the most probable actions instead of drawing them"""
     seed: int = 1
     """seed of the actions"""
     cuda: bool = True
@@ -611,13 +618,18 @@ class Checkpoint:
     args: Any  # the script's Args
 
     @classmethod
-    def read(cls, path: str) -> "Checkpoint":
-        """Read a file; raise ValueError if it is no checkpoint or its script is not here, OSError without a file."""
+    def read(cls, path: str, env_options: str | None = None) -> "Checkpoint":
+        """Read a file, to play with further reset options, JSON.
+
+        Raises ValueError if it is no checkpoint, its script is not here or its environment does not have the options,
+        OSError without a file.
+        """
         saved = read_model(path)
         script = import_script(saved, path)
         # A file to resume from holds much more, which would stay in memory.
         needed = {name: saved[name] for name in ("script", "args", "weights")}
-        return cls(path, script, needed, saved.get("step"), saved_args(script.Args, saved))
+        args = with_options(saved_args(script.Args, saved), env_options)
+        return cls(path, script, needed, saved.get("step"), args)
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments by name, with the script's name, and the step if it is known."""
@@ -632,21 +644,24 @@ def play(checkpoint: Checkpoint, config: Config) -> dict[str, np.ndarray]:
     """
     args = checkpoint.args
     device = torch.device("cuda" if torch.cuda.is_available() and config.cuda else "cpu")
-    levels = evaluation_levels(args, config.levels, config.repeats)
+    levels = evaluation_levels(args, config.levels, config.repeats, config.start_level)
     envs = envs_for(args, len(levels))
     _, infos = envs.reset()
     agent = make_agent(checkpoint.script.Agent, envs, infos, args).to(device)
     load_weights(agent, checkpoint.saved, checkpoint.path)
     torch.manual_seed(config.seed)
-    found = evaluate(agent, envs, levels, config.max_steps, args.amp)
+    found = evaluate(agent, envs, levels, config.max_steps, amp=args.amp, deterministic=config.deterministic)
     envs.close()
     return {name: numbers.reshape(config.levels, config.repeats) for name, numbers in found.items()}
 
 
 def title_of(args: dict[str, Any], config: Config) -> str:
     """Name the task and the levels of it that are played."""
-    first = args["start_level"] + args["num_levels"]
-    return f"{task_of(args)}, levels {first} to {first + config.levels - 1}, {config.repeats} times each"
+    after = args["start_level"] + args["num_levels"]
+    first = after if config.start_level is None else config.start_level
+    trained_on = " (of its training)" if first < after and first + config.levels > args["start_level"] else ""
+    levels = f"levels {first} to {first + config.levels - 1}{trained_on}, {config.repeats} times each"
+    return f"{task_of(args)}, {levels}{', most probable actions' if config.deterministic else ''}"
 
 
 def choose_metrics(wanted: tuple[str, ...], env_id: str, played: list[dict[str, np.ndarray]]) -> list[str]:
@@ -667,7 +682,7 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
 
     A task that does not report the wanted metrics gets a line instead. Raises ValueError if none does.
     """
-    checkpoints = {path: Checkpoint.read(path) for path in dict.fromkeys(config.checkpoints)}
+    checkpoints = {path: Checkpoint.read(path, config.env_options) for path in dict.fromkeys(config.checkpoints)}
     arguments = {path: checkpoint.arguments() for path, checkpoint in checkpoints.items()}
     tasks = tasks_of(arguments, lambda args: title_of(args, config))
     played = {path: play(each, config) for path, each in tqdm(checkpoints.items(), unit=" agents")}
@@ -697,8 +712,8 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
 
 def check_numbers(config: Config) -> None:
     """Raise ValueError for the first number that cannot work."""
-    for name, low in (("levels", 1), ("repeats", 1), ("max_steps", 1), ("seed", 0)):
-        if not low <= getattr(config, name) < 2**63:
+    for name, low in (("levels", 1), ("repeats", 1), ("max_steps", 1), ("seed", 0), ("start_level", 0)):
+        if not low <= (getattr(config, name) or 0) < 2**63:
             raise ValueError(f"{flag(name)} is {getattr(config, name)}; it must be from {low} to 2 ** 63 - 1")
     if (episodes := config.levels * config.repeats) > MOST_EPISODES:
         raise ValueError(f"--levels x --repeats is {episodes}; at most {MOST_EPISODES} are played")
@@ -707,7 +722,7 @@ def check_numbers(config: Config) -> None:
 def main(config: Config) -> None:
     """Do what the command line asks for.
 
-    Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
+    Raises ValueError, OSError, ImportError, gymnasium.error.Error or RunError, each with one line for the user.
     """
     if bool(config.checkpoints) == bool(config.curves):
         raise ValueError("give either checkpoints to play with (runs/*/model.pt), or --curves and run folders (runs/*)")
@@ -727,7 +742,7 @@ if __name__ == "__main__":
     config = tyro.cli(Config)
     try:
         main(config)
-    except (ValueError, OSError, ImportError, gym.error.Error) as error:
+    except (ValueError, OSError, ImportError, gym.error.Error, RunError) as error:
         sys.exit(f"evaluate.py: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
         sys.exit(130)

@@ -83,8 +83,12 @@ class Args:
     """any Gymnasium id with Discrete or MultiDiscrete actions; as module:id if importing a module registers it"""
     env_options: str = "{}"
     """reset options of a Memory Gym environment as JSON, e.g. '{"command_count": [4]}'"""
+    env_kwargs: str = "{}"
+    """constructor arguments of another package's environment as JSON, e.g. '{"size": 9}'"""
+    async_envs: bool = False
+    """run each environment in a process of its own, for slow ones of other packages"""
     num_levels: NonNegativeInt = 100_000
-    """number of levels that a Memory Gym environment trains on (0: no limit)"""
+    """number of levels to train on (0: no limit); in environments of other packages, a level is a seed"""
     start_level: NonNegativeInt = 0
     """the first of these levels"""
     obs_type: Literal["pixels", "vector"] = "pixels"
@@ -323,12 +327,13 @@ def collect(
                 value = agent.get_value(final, state)  # with the memory of the episode that ended
                 rollout.truncation_values[t] = value.where(rollout.truncated[t] & ~rollout.terminated[t], 0.0)
             agent.memory.reset(state, torch.as_tensor(done))
-            rollout.next_obs, rollout.next_ground_truth = next_obs, ground_truth_of(infos, args)
+            rollout.next_obs = next_obs
+            rollout.next_ground_truth = ground_truth_of(infos, args, rollout.next_ground_truth)
             if done.any():
                 episodes["charts/episodic_return"] += infos["episode"]["r"][done].tolist()
                 episodes["charts/episodic_length"] += infos["episode"]["l"][done].tolist()
-                for name, _, values in final_numbers(infos, done):
-                    episodes[f"episode/{name}"] += values.tolist()
+                for name, values in final_numbers(infos, done).items():
+                    episodes[f"episode/{name}"] += values[~np.isnan(values)].tolist()
         return agent.get_value(as_tensors(rollout.next_obs, device), state), episodes
 
 
@@ -434,7 +439,7 @@ def mean_logs(step_logs: list[dict[str, Tensor]], rollout: Rollout) -> dict[str,
     """
     losses = {name: torch.stack([logs[name] for logs in step_logs]).mean().item() for name in step_logs[0]}
     if not (math.isfinite(losses["loss"]) and math.isfinite(losses["grad_norm"])):
-        raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
+        raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr, or smaller rewards")
     # Before the first gradient step, ratios differ from 1 by rounding only, if the update recomputes what acted.
     losses["ratio_error"] = step_logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
@@ -490,8 +495,8 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: f
 def log_barrier(policy: list[Categorical]) -> Tensor:
     """Return the mean log-probability over all actions of a branch and over samples, summed over branches.
 
-    It is largest for a uniform policy. Near probability 0 the gradients of surrogate loss and entropy vanish, but that
-    of the log barrier does not (Agarwal et al., On the Theory of Policy Gradient Methods, 2021).
+    It is largest for a uniform policy. Unlike the entropy's, its gradient does not vanish near probability 0 (Agarwal
+    et al., On the Theory of Policy Gradient Methods, 2021).
     """
     return sum(branch.logits.mean() for branch in policy)  # a Categorical's logits are normalized
 
@@ -657,6 +662,8 @@ class Memory(nn.Module):
 
     def advance(self, state: MemoryState, hidden: Tensor) -> None:
         """Store the hidden state before the step, and move on to the one after it."""
+        if state.t == len(state.stored):
+            raise IndexError("there is no room for this step; begin_rollout(state, carry(state)) makes room again")
         state.stored[state.t] = state.hidden
         state.hidden = hidden
         state.t += 1
@@ -874,6 +881,7 @@ def setup(args: Args) -> Run:
     device, checkpoint = prepare(args, script, Memory.longest_piece(args))  # checkpoint: None without --resume
     with report_out_of_memory(args, device):
         envs = training_envs(args, checkpoint)
+    with report_out_of_memory(args, device, envs.single_observation_space):
         obs, infos = envs.reset()
         agent = make_agent(Agent, envs, infos, args).to(device)
         rollout = Rollout.allocate(args.num_steps, obs, ground_truth_of(infos, args), agent)

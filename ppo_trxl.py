@@ -86,8 +86,12 @@ class Args:
     """any Gymnasium id with Discrete or MultiDiscrete actions; as module:id if importing a module registers it"""
     env_options: str = "{}"
     """reset options of a Memory Gym environment as JSON, e.g. '{"command_count": [4]}'"""
+    env_kwargs: str = "{}"
+    """constructor arguments of another package's environment as JSON, e.g. '{"size": 9}'"""
+    async_envs: bool = False
+    """run each environment in a process of its own, for slow ones of other packages"""
     num_levels: NonNegativeInt = 100_000
-    """number of levels that a Memory Gym environment trains on (0: no limit)"""
+    """number of levels to train on (0: no limit); in environments of other packages, a level is a seed"""
     start_level: NonNegativeInt = 0
     """the first of these levels"""
     obs_type: Literal["pixels", "vector"] = "pixels"
@@ -350,12 +354,13 @@ def collect(
                 value = agent.get_value(final, state)  # with the memory of the episode that ended
                 rollout.truncation_values[t] = value.where(rollout.truncated[t] & ~rollout.terminated[t], 0.0)
             agent.memory.reset(state, torch.as_tensor(done))
-            rollout.next_obs, rollout.next_ground_truth = next_obs, ground_truth_of(infos, args)
+            rollout.next_obs = next_obs
+            rollout.next_ground_truth = ground_truth_of(infos, args, rollout.next_ground_truth)
             if done.any():
                 episodes["charts/episodic_return"] += infos["episode"]["r"][done].tolist()
                 episodes["charts/episodic_length"] += infos["episode"]["l"][done].tolist()
-                for name, _, values in final_numbers(infos, done):
-                    episodes[f"episode/{name}"] += values.tolist()
+                for name, values in final_numbers(infos, done).items():
+                    episodes[f"episode/{name}"] += values[~np.isnan(values)].tolist()
         return agent.get_value(as_tensors(rollout.next_obs, device), state), episodes
 
 
@@ -461,7 +466,7 @@ def mean_logs(step_logs: list[dict[str, Tensor]], rollout: Rollout) -> dict[str,
     """
     losses = {name: torch.stack([logs[name] for logs in step_logs]).mean().item() for name in step_logs[0]}
     if not (math.isfinite(losses["loss"]) and math.isfinite(losses["grad_norm"])):
-        raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr")
+        raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr, or smaller rewards")
     # Before the first gradient step, ratios differ from 1 by rounding only, if the update recomputes what acted.
     losses["ratio_error"] = step_logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
@@ -517,8 +522,8 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: f
 def log_barrier(policy: list[Categorical]) -> Tensor:
     """Return the mean log-probability over all actions of a branch and over samples, summed over branches.
 
-    It is largest for a uniform policy. Near probability 0 the gradients of surrogate loss and entropy vanish, but that
-    of the log barrier does not (Agarwal et al., On the Theory of Policy Gradient Methods, 2021).
+    It is largest for a uniform policy. Unlike the entropy's, its gradient does not vanish near probability 0 (Agarwal
+    et al., On the Theory of Policy Gradient Methods, 2021).
     """
     return sum(branch.logits.mean() for branch in policy)  # a Categorical's logits are normalized
 
@@ -728,6 +733,8 @@ class Memory(nn.Module):
     @torch.no_grad()
     def advance(self, state: MemoryState, hidden: Tensor) -> None:
         """Store the step's hidden states (N, K + 1, D), cache their keys and values, and move on."""
+        if state.now == len(state.row_step):
+            raise IndexError("there is no room for this step; begin_rollout(state, carry(state)) makes room again")
         state.hidden[state.now] = hidden
         state.row_step[state.now] = state.episode_step
         position = self.position(state.episode_step.to(hidden.device), hidden.dtype)  # (N, D)
@@ -773,7 +780,7 @@ class Memory(nn.Module):
         query_rows = (row + columns).clamp(max=last_row)  # (S, L)
         query_step = state.row_step[query_rows, env].where(pieces.is_real(), 0)  # (S, L); padding attends to nothing
         # A query in column c is at most c steps further in that episode, and attends no further back than the first.
-        length = self.window_length(query_step[:, 0])
+        length = min(max(int(query_step[:, 0].max()), 1), self.window)
         key_columns = torch.arange(-length, len(columns) - 1)  # (M,)
         key_rows = (row + key_columns).clamp(max=last_row)  # (S, M)
         key_step = state.row_step[key_rows, env].to(device)  # (S, M)
@@ -794,14 +801,10 @@ class Memory(nn.Module):
 
     def attended_rows(self, state: MemoryState) -> tuple[slice, Tensor, Tensor]:
         """Return the M rows that the next step may attend to, their ages (1, M), and the mask (N, 1, M)."""
-        length = self.window_length(state.episode_step)
+        length = min(max(int(state.episode_step.max()), 1), self.window)  # at least 1, since attention needs a key
         age = torch.arange(length, 0, -1)[None]
         mask = attention_mask(age, state.episode_step[:, None], self.window)[:, None]
         return slice(state.now - length, state.now), age.to(state.hidden.device), mask.to(state.hidden.device)
-
-    def window_length(self, episode_step: Tensor) -> int:
-        """Return how much of the window queries at these steps use; at least 1, since attention needs a key."""
-        return min(max(int(episode_step.max()), 1), self.window)
 
     def encode_step(self, episode_step: Tensor, dtype: torch.dtype) -> Tensor:
         """Encode steps of episodes (...) by the learned table, or as sines and cosines: (..., D)."""
@@ -824,10 +827,7 @@ class Memory(nn.Module):
 
 
 def attention_mask(age: Tensor, episode_step: Tensor, window: int) -> Tensor:
-    """Return whether a query at this step of its episode attends to a key that is `age` steps older.
-
-    The one rule of what is attended to: in the rollout, for the bootstrap value and in the update.
-    """
+    """Return whether a query at this step of its episode attends to a key `age` steps older: one rule, everywhere."""
     return (age >= 1) & (age <= episode_step) & (age <= window)
 
 
@@ -1132,6 +1132,7 @@ def setup(args: Args) -> Run:
     device, checkpoint = prepare(args, script, Memory.longest_piece(args))  # checkpoint: None without --resume
     with report_out_of_memory(args, device):
         envs = training_envs(args, checkpoint)
+    with report_out_of_memory(args, device, envs.single_observation_space):
         obs, infos = envs.reset()
         agent = make_agent(Agent, envs, infos, args).to(device)
         rollout = Rollout.allocate(args.num_steps, obs, ground_truth_of(infos, args), agent)

@@ -2,10 +2,12 @@
 
     flags          types of flags with bounds, their spelling, checks
     environments   any Gymnasium id, ready to train on
+    lanes          environments side by side, each with seeds and errors of its own
     observations   observations as pictures and vectors
     wrappers       what can be observed too: stacks, the step, the last action, Fourier features, spotlights
     video          videos of the first environment
     evaluation     scores on levels that are not trained on
+    acting         a trained agent in a program of one's own
     runs           run folder, logs, progress bar, signals, command line
     checkpoints    models and checkpoints: written, read, resumed
     processes      several processes that train one agent

@@ -181,7 +181,7 @@ def import_script(saved: dict[str, Any], path: str | Path) -> ModuleType:
 def make_agent(kind: type[nn.Module], envs: gym.vector.VectorEnv, infos: dict, args: Any) -> nn.Module:
     """Make an agent, of a script's Agent, for environments; infos are those of a reset.
 
-    Raises ValueError for spaces that do not suit, or if there is no ground truth to estimate.
+    Raises ValueError for spaces that do not suit, RunError if there is no ground truth to estimate.
     """
     truth = ground_truth_of(infos, args)
     size = 0 if truth is None else truth.shape[1]

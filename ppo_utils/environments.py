@@ -7,20 +7,22 @@ A lane is one of the N environments that step together.
 Shape letters: N lanes, A action branches, G entries of the ground truth.
 """
 
-import contextlib
 import difflib
+import functools
 import importlib
 import json
+import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.envs.registration import EnvSpec, load_env_creator
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformAction
 from torch import Tensor
 
@@ -28,8 +30,9 @@ import memory_gym_envs  # noqa: F401 (registers its ids)
 from memory_gym_envs.base import checked_integer
 from memory_gym_envs.options import brief
 from memory_gym_envs.saving import Saved
+from ppo_utils.lanes import OWN, Levels, one_line, one_line_errors, same_step_envs
 from ppo_utils.observations import ObservationParts
-from ppo_utils.processes import rank_and_size
+from ppo_utils.processes import RunError, rank_and_size
 from ppo_utils.wrappers import (
     FourierFeatures,
     GrayscaleStack,
@@ -40,13 +43,21 @@ from ppo_utils.wrappers import (
     branch_sizes,
 )
 
+T = TypeVar("T")  # a script's Args
+
 
 def envs_for(args: Any, num_envs: int, **kwargs: Any) -> VectorEnv:
     """Make the environments that a script's arguments describe; kwargs and errors are those of `make_envs`."""
-    names = ("num_levels", "start_level", "obs_type")
-    names += ("frame_stack", "step_encoding", "observe_last_action", "spotlight_perturbation", "vector_frequencies")
-    kwargs |= {name: getattr(args, name) for name in names}
-    return make_envs(args.env_id, num_envs, options=parse_options(args.env_id, args.env_options), **kwargs)
+    kwargs |= {name: getattr(args, name) for name in ("num_levels", "start_level", "obs_type")} | wrappers_of(args)
+    options, env_kwargs = parse_options(args.env_id, args.env_options), json_object("--env-kwargs", args.env_kwargs)
+    kwargs |= {"options": options or None, "env_kwargs": env_kwargs, "asynchronous": args.async_envs}
+    return make_envs(args.env_id, num_envs, **kwargs)
+
+
+def wrappers_of(args: Any) -> dict[str, Any]:
+    """Return the arguments of `wrap_envs` that are among a script's."""
+    names = ("frame_stack", "step_encoding", "observe_last_action", "spotlight_perturbation", "vector_frequencies")
+    return {name: getattr(args, name) for name in names}
 
 
 def training_envs(args: Any, checkpoint: dict[str, Any] | None) -> VectorEnv:
@@ -71,15 +82,13 @@ def make_envs(
     seed: int | Sequence[int] | None = None,
     first_lane: int = 0,
     options: dict[str, Any] | None = None,
+    env_kwargs: dict[str, Any] | None = None,
+    asynchronous: bool = False,
     num_levels: int = 0,
     start_level: int = 0,
     obs_type: str = "pixels",
-    frame_stack: int = 0,
-    step_encoding: bool = False,
-    observe_last_action: bool = False,
-    spotlight_perturbation: bool = False,
-    vector_frequencies: int = 0,
     render_mode: str | None = None,
+    **wrappers: Any,
 ) -> VectorEnv:
     """Make a vector environment of N lanes with same-step autoreset; the caller's `reset()` begins.
 
@@ -89,15 +98,19 @@ def make_envs(
         seeds and play the episodes of these lanes of it. Vector environments of other packages may seed all lanes
         together, and then do not.
     options: reset parameters of a Memory Gym environment, the defaults of every reset; see `parse_options`.
-    num_levels, start_level, obs_type: of Memory Gym environments; others have no such thing and ignore them, with a
-        line on stderr where pictures are shown though vectors were asked for.
-    frame_stack, step_encoding, observe_last_action, spotlight_perturbation, vector_frequencies: see GrayscaleStack and
-        VectorStack, StepEncoding, LastAction, SpotlightPerturbation, FourierFeatures.
+    env_kwargs: constructor arguments of another package's environment.
+    asynchronous: every environment in a process of its own, for slow environments of other packages.
+    num_levels, start_level: of Memory Gym environments. With a num_levels above 0, resets of others take one of the
+        seeds start_level, start_level + 1, ..., num_levels of them, if they are made one by one, not as vector
+        environments.
+    obs_type: of Memory Gym environments; others ignore it, with a line on stderr if they show pictures.
     render_mode: what render() draws; of other packages than this, always rgb_array.
+    wrappers: arguments of `wrap_envs`.
 
-    Observations are dicts of pictures and vectors, see `ObservationParts`; actions are integers (N, A), see
-    `branch_actions`; infos hold the statistics of ended episodes, see Gymnasium's vector RecordEpisodeStatistics.
-    What single environments raise in later steps and resets says which lane it was, see `LaneErrors`.
+    Observations and actions are those of `wrap_envs`; infos hold the statistics of ended episodes, see Gymnasium's
+    vector RecordEpisodeStatistics.
+    What single environments raise in later steps and resets says which lane it was, see `Lane`. NaN and infinity in
+    observations and rewards, and numbers outside of a discrete space, raise RunError.
 
     Raises gymnasium.error.Error for an unknown id, ImportError for a missing package, ValueError for an environment
     that cannot be made or that is not supported, and for wrong arguments.
@@ -107,21 +120,54 @@ def make_envs(
     spec, memory_gym = find_spec(env_id), is_memory_gym(env_id)
     if options and not memory_gym:
         raise ValueError(f"options are reset parameters of Memory Gym environments; {env_id} has none")
-    levels = {"num_levels": num_levels, "start_level": start_level, "obs_type": obs_type, "options": options}
-    kwargs = levels if memory_gym else {}
+    if memory_gym and (env_kwargs or asynchronous):
+        what = "env_kwargs are" if env_kwargs else "asynchronous is"
+        raise ValueError(f"{what} for environments of other packages; {env_id} has options, and is faster as it is")
+    kwargs = {**(env_kwargs or {})}
+    if memory_gym:
+        kwargs = {"num_levels": num_levels, "start_level": start_level, "obs_type": obs_type, "options": options}
     if render_mode is not None:
         kwargs["render_mode"] = render_mode if memory_gym else "rgb_array"
     with one_line_errors(f"{env_id} cannot be made"):
-        envs = same_step_envs(spec, num_envs, kwargs)
+        envs = same_step_envs(spec, num_envs, kwargs, first_lane, Levels(start_level, num_levels), asynchronous)
 
-    envs = ObservationParts(branch_actions(envs))
+    envs = wrap_envs(envs, first_lane, **wrappers)
     pictures = [name for name, part in envs.single_observation_space.items() if len(part.shape) == 3]
     if obs_type == "vector" and pictures and not memory_gym:
         print(f"{env_id} has no vectors to show instead of its {', '.join(pictures)}", file=sys.stderr)
+
+    if seed is not None:
+        with one_line_errors(f"{env_id} cannot be reset"):
+            # Neighbouring seeds must not share lanes, so the lanes' seeds count up from a hash of the seed. It has 30
+            # bits, since some simulators take seeds below 2 ** 31 only.
+            envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0] >> 2) + first_lane)
+    # An explicit seed is a level of its own, which nobody plays: what counts episodes comes after it.
+    return EpisodeStatistics(envs)
+
+
+def wrap_envs(
+    envs: VectorEnv,
+    first_lane: int = 0,
+    *,
+    frame_stack: int = 0,
+    step_encoding: bool = False,
+    observe_last_action: bool = False,
+    spotlight_perturbation: bool = False,
+    vector_frequencies: int = 0,
+) -> VectorEnv:
+    """Wrap a vector environment with same-step autoreset, so that agents can observe it and act in it.
+
+    Observations are dicts of pictures and vectors, see `ObservationParts`; actions are integers (N, A), see
+    `branch_actions`. first_lane: number of the first environment, for error messages. All else: see GrayscaleStack and
+    VectorStack, StepEncoding, LastAction, SpotlightPerturbation, FourierFeatures. Raises ValueError for an environment
+    that does not suit.
+    """
+    envs = ObservationParts(branch_actions(envs), first_lane)
     if spotlight_perturbation:
         with one_line_errors("--spotlight-perturbation"):
             envs = SpotlightPerturbation(envs)
     if frame_stack:
+        pictures = any(len(part.shape) == 3 for part in envs.single_observation_space.values())
         with one_line_errors("--frame-stack"):
             envs = (GrayscaleStack if pictures else VectorStack)(envs, frame_stack)
     if step_encoding:
@@ -131,16 +177,7 @@ def make_envs(
     if vector_frequencies:
         with one_line_errors("--vector-frequencies"):
             envs = FourierFeatures(envs, vector_frequencies)
-
-    first_seed = None
-    if seed is not None:
-        with one_line_errors(f"{env_id} cannot be reset"):
-            # Neighbouring seeds must not share lanes, so the lanes' seeds count up from a hash of the seed.
-            first_seed = int(np.random.SeedSequence(seed).generate_state(1)[0]) + first_lane
-            envs.reset(seed=first_seed)
-    locate_errors(envs.unwrapped, first_lane, first_seed)  # only now: the errors above already say what failed
-    # An explicit seed is a level of its own, which nobody plays: what counts episodes comes after it.
-    return EpisodeStatistics(envs)
+    return envs
 
 
 # ---- saved states ----
@@ -241,6 +278,8 @@ def find_spec(env_id: str) -> EnvSpec:
     if module.startswith("."):
         raise ImportError(f"the module of {env_id} begins with a dot; give its whole name")
     if module:
+        if "" not in sys.path:
+            sys.path.append("")  # modules in the current folder, after all others
         importlib.import_module(module)
     if name not in gym.registry and (near := difflib.get_close_matches(name, gym.registry, n=1)):
         raise gym.error.NameNotFound(f"there is no environment {name}; the nearest is {near[0]}")
@@ -258,112 +297,37 @@ def is_memory_gym(env_id: str) -> bool:
     return str(find_spec(env_id).entry_point).startswith("memory_gym_envs")
 
 
-def parse_options(env_id: str, text: str) -> dict[str, Any] | None:
-    """Parse --env-options; raise ValueError if it is no JSON object or the environment has no such parameters."""
+def json_object(flag: str, text: str) -> dict[str, Any]:
+    """Parse a flag's JSON object; raise ValueError if it is none."""
     try:
-        options = json.loads(text)
+        found = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"--env-options is no JSON ({error}): {text}") from None
-    if not isinstance(options, dict):
-        raise ValueError(f'--env-options must be a JSON object such as {{"visual_feedback": false}}, not {text}')
+        raise ValueError(f"{flag} is no JSON ({error}): {brief(text)}") from None
+    if not isinstance(found, dict):
+        raise ValueError(f'{flag} must be a JSON object such as {{"size": 9}}, not {text}')
+    return found
+
+
+def parse_options(env_id: str, text: str) -> dict[str, Any]:
+    """Parse --env-options; raise ValueError if it is no JSON object or the environment has no such parameters."""
+    options = json_object("--env-options", text)
     if options and not is_memory_gym(env_id):
-        raise ValueError(f"--env-options are reset parameters of Memory Gym environments; {env_id} has none")
-    return options or None
+        raise ValueError(
+            f"--env-options are reset parameters of Memory Gym environments; {env_id} has none (--env-kwargs are "
+            "constructor arguments)"
+        )
+    return options
 
 
-# ---- the environments themselves ----
+def with_options(args: T, text: str | None) -> T:
+    """Return a script's arguments with further --env-options, JSON, over those that it has; None: no others.
 
-
-def same_step_envs(spec: EnvSpec, num_envs: int, kwargs: dict[str, Any]) -> VectorEnv:
-    """Make the id's own vector environment if it resets in the same step, else Gymnasium's synchronous one.
-
-    Raises ValueError if there is no environment that resets in the same step.
+    Raises ValueError as `parse_options`.
     """
-    own = spec.vector_entry_point
-    if own is not None and (spec.entry_point is None or resets_in_same_step(creator(own))):
-        envs = gym.make_vec(spec.id, num_envs, vectorization_mode="vector_entry_point", **kwargs)
-    else:
-        same_step = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        envs = gym.make_vec(spec.id, num_envs, vectorization_mode="sync", vector_kwargs=same_step, **kwargs)
-    if not resets_in_same_step(envs):
-        raise ValueError(f"{spec.id} does not reset an ended episode in the same step")
-    return envs
-
-
-def creator(entry_point: str | Callable) -> Callable:
-    """Return what makes the environment: its class, as a rule."""
-    return load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
-
-
-def resets_in_same_step(envs: Any) -> bool:
-    """Return whether the metadata of an environment, or of its class, says so."""
-    return getattr(envs, "metadata", {}).get("autoreset_mode") == AutoresetMode.SAME_STEP
-
-
-@contextlib.contextmanager
-def one_line_errors(what: str) -> Iterator[None]:
-    """Turn what an environment raises into a ValueError of one line that begins with what failed.
-
-    Errors whose cause is the machine or the installation stay as they are.
-    """
-    try:
-        yield
-    except (gym.error.Error, ImportError, OSError, MemoryError):
-        raise
-    except Exception as error:
-        raise ValueError(f"{what}: {one_line(error) or repr(error)}") from error
-
-
-def one_line(error: Exception) -> str:
-    """Return the error's message without line breaks; empty if it has none."""
-    return " ".join(str(error).split())
-
-
-class LaneErrors(gym.Wrapper):
-    """One environment of several, whose errors say which it is and how to get there again.
-
-    What its step or reset raises becomes the cause of a RuntimeError, whose message has the number of the lane, the
-    seed that the environment was last reset with, and the number of the step since then. Automatic resets and those
-    without a seed do not start the count again.
-
-    seed: what it was reset with before, None for nothing.
-    """
-
-    def __init__(self, env: gym.Env, lane: int, seed: int | None):
-        super().__init__(env)
-        self._lane, self._seed, self._steps = lane, seed, 0
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment. Raises RuntimeError for what it raises."""
-        if seed is not None:
-            self._seed, self._steps = seed, 0
-        try:
-            return self.env.reset(seed=seed, options=options)
-        except Exception as error:
-            raise self._located(error, "the reset after step") from error
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment. Raises RuntimeError for what it raises."""
-        self._steps += 1
-        try:
-            return self.env.step(action)
-        except Exception as error:
-            raise self._located(error, "step") from error
-
-    def _located(self, error: Exception, where: str) -> RuntimeError:
-        began = "it was made, never reset with a seed" if self._seed is None else f"its reset with seed {self._seed}"
-        what = f"{type(error).__name__} in {where} {self._steps} since {began}"
-        return RuntimeError(": ".join(filter(None, [f"environment {self._lane} raised {what}", one_line(error)])))
-
-
-def locate_errors(envs: VectorEnv, first_lane: int, first_seed: int | None) -> None:
-    """Put the environments that Gymnasium steps one after the other into `LaneErrors`.
-
-    first_lane, first_seed: the first one's number and what it was reset with; the others' count up from there.
-    """
-    if isinstance(envs, SyncVectorEnv):
-        seeds = [None if first_seed is None else first_seed + i for i in range(envs.num_envs)]
-        envs.envs = [LaneErrors(env, first_lane + i, seeds[i]) for i, env in enumerate(envs.envs)]
+    if text is None:
+        return args
+    options = parse_options(args.env_id, args.env_options) | parse_options(args.env_id, text)
+    return replace(args, env_options=json.dumps(options))
 
 
 # ---- actions ----
@@ -381,40 +345,92 @@ def branch_actions(envs: VectorEnv) -> VectorEnv:
         if np.shape(actions) != (envs.num_envs, len(sizes)):
             shape = f"({envs.num_envs}, {len(sizes)}), lanes and branches"
             raise ValueError(f"actions must be integers of shape {shape}, not {brief(actions)}")
-        actions = np.asarray(actions) + space.start  # the first action's number, 0 unless the space says otherwise
-        return actions[:, 0] if isinstance(space, gym.spaces.Discrete) else actions
+        return env_actions(space, np.asarray(actions))
 
     return TransformAction(envs, to_env, single_action_space=gym.spaces.MultiDiscrete(sizes))
+
+
+def env_actions(space: gym.Space, actions: np.ndarray) -> np.ndarray:
+    """Turn actions (N, A), counted from 0, into the environment's own: (N,) for Discrete, (N, A) for MultiDiscrete."""
+    actions = actions + space.start  # the first action's number, 0 unless the space says otherwise
+    return actions[:, 0] if isinstance(space, gym.spaces.Discrete) else actions
 
 
 # ---- what infos say ----
 
 
-def ground_truth_of(infos: dict[str, Any], args: Any) -> np.ndarray | None:
+def ground_truth_of(infos: dict[str, Any], args: Any, before: np.ndarray | None = None) -> np.ndarray | None:
     """Return the ground truth (N, G) that --ground-truth-coef estimates, None where it is 0.
 
-    Raises ValueError if the environment reports none.
+    before: that of the step before, if there is one. Raises RunError if an environment reports none, or other than G
+    finite numbers.
     """
     if not args.ground_truth_coef:
         return None
-    truth = np.asarray(infos.get("ground_truth"))
-    if truth.ndim != 2 or truth.dtype.kind not in "biuf":
-        raise ValueError("--ground-truth-coef needs an environment that has ground_truth, an array, in its info; use 0")
+    if OWN in infos:
+        truths = [info.get("ground_truth") for (info,) in infos[OWN]]
+        reported = [truth is not None for truth in truths]
+    else:
+        truths = infos.get("ground_truth")
+        reported = infos.get("_ground_truth", truths is not None)
+    wanted = "--ground-truth-coef needs ground_truth in every info, of every reset and step"
+    if not np.all(reported):
+        raise RunError(f"{wanted}; environment {int(np.argmin(np.atleast_1d(reported)))} reports none; use 0")
+    try:
+        truth = np.asarray(truths, np.float32)
+    except (TypeError, ValueError):
+        truth = np.zeros(())
+    if truth.ndim != 2 or not np.isfinite(truth).all() or (before is not None and truth.shape != before.shape):
+        raise RunError(f"{wanted}: an array of numbers, as many in all environments and always, and finite; use 0")
     return truth
 
 
-def final_numbers(infos: dict[str, Any], lanes: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield each number in the final infos of the given lanes: its name, which of them have it (N,), and theirs.
+def final_numbers(infos: dict[str, Any], lanes: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the numbers in the final infos of the given lanes by name, (N,) float64 each, NaN where a lane has none.
 
-    lanes: (N,) bool.
+    What is no finite number is left out, and a line on stderr says so, once for each name. lanes: (N,) bool.
     """
+    numbers = {}
+    for lane in np.flatnonzero(lanes).tolist():
+        for name, value in final_info_of(infos, lane).items():
+            number = as_number(value)
+            if number is not None:
+                numbers.setdefault(name, np.full(len(lanes), np.nan))[lane] = number
+            elif name != "ground_truth":
+                tell_left_out(name)
+    return numbers
+
+
+def final_info_of(infos: dict[str, Any], lane: int) -> dict[str, Any]:
+    """Return the last info of a lane's episode that just ended, however its environments batch infos."""
     final = infos.get("final_info", {})
+    if isinstance(final, np.ndarray):  # a dict for each lane
+        return final[lane] or {}
+    if OWN in final:
+        return final[OWN][lane][0]
+    found = {}
     for name, values in final.items():
-        which = lanes & final.get(f"_{name}", False)
-        if which.any() and isinstance(values, np.ndarray) and all(np.isscalar(value) for value in values[which]):
-            found = np.array(values[which].tolist())
-            if found.dtype.kind in "biuf":
-                yield name, which, found
+        reported = final.get(f"_{name}", True)
+        if not name.startswith("_") and (reported if np.ndim(reported) == 0 else reported[lane]):
+            found[name] = values[lane] if np.ndim(values) else values
+    return found
+
+
+def as_number(value: Any) -> float | None:
+    """Return a finite number, or an array of one, as a float; None for all else."""
+    try:
+        if hasattr(value, "item"):
+            value = value.item()
+        number = None if isinstance(value, (str, bytes)) else float(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError):  # RuntimeError: torch's
+        return None
+    return number if number is not None and math.isfinite(number) else None
+
+
+@functools.cache
+def tell_left_out(name: str) -> None:
+    """Say once that something in the infos is not logged."""
+    print(f"{name}, in the info that ends an episode, is no finite number there, and is left out", file=sys.stderr)
 
 
 def final_observations(

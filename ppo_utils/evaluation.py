@@ -8,24 +8,47 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
-from torch import nn
+from torch import Tensor, nn
 
 from ppo_utils.environments import as_tensors, final_numbers
 
 REPEATS = 3  # times that each level is played
+MEMORY_STEPS = 64  # that a memory has room for, before it begins anew with what it carries on
 
 
-def evaluation_levels(args: Any, levels: int, repeats: int = REPEATS) -> list[int]:
-    """Return the seeds (N,) of an evaluation's levels: those that follow the training levels, with repeats."""
-    first = args.start_level + args.num_levels
+def first_unseen(args: Any) -> int:
+    """Return the first level after those that a script's arguments train on."""
+    return args.start_level + args.num_levels
+
+
+def evaluation_levels(args: Any, levels: int, repeats: int = REPEATS, first: int | None = None) -> list[int]:
+    """Return the seeds (N,) of an evaluation's levels, with repeats: from `first`, or from the first unseen one."""
+    first = first_unseen(args) if first is None else first
     return [level for level in range(first, first + levels) for _ in range(repeats)]
+
+
+def most_probable(agent: nn.Module, obs: dict[str, Tensor], state: Any) -> Tensor:
+    """Return each branch's most probable action, (N, A), and move the memory's state on, as `get_action_and_value`."""
+    x, hidden = agent.memory.step(state, agent.encoder(obs))
+    agent.memory.advance(state, hidden)
+    logits, _, _ = agent.heads(x)
+    return torch.stack([branch.logits.argmax(-1) for branch in agent.heads.distributions(logits)], -1)
 
 
 @torch.no_grad()
 def evaluate(
-    agent: nn.Module, envs: VectorEnv, levels: list[int], max_steps: int, amp: bool = False, memory_steps: int = 64
+    agent: nn.Module,
+    envs: VectorEnv,
+    levels: list[int],
+    max_steps: int,
+    *,
+    amp: bool = False,
+    deterministic: bool = False,
+    memory_steps: int = MEMORY_STEPS,
 ) -> dict[str, np.ndarray]:
     """Play each of the levels (N,) in an environment of its own, with the stochastic policy (§6.1.3).
+
+    With deterministic, actions are the most probable ones.
 
     Returns metrics (N,) by name: return, length, finished (0 for an episode that max_steps cut short), and every number
     in an episode's final info, NaN where an episode did not report it. The memory begins empty, and has room for
@@ -40,15 +63,19 @@ def evaluate(
         for t in range(max_steps):
             if t % memory_steps == 0:
                 agent.memory.begin_rollout(memory, agent.memory.carry(memory))
-            actions, _, _ = agent.get_action_and_value(as_tensors(obs, device), memory)
+            if deterministic:
+                actions = most_probable(agent, as_tensors(obs, device), memory)
+            else:
+                actions, _, _ = agent.get_action_and_value(as_tensors(obs, device), memory)
             obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
             done = terminated | truncated
             agent.memory.reset(memory, torch.as_tensor(done))
             metrics["return"] += rewards * playing
             metrics["length"] += playing
-            for name, which, values in final_numbers(infos, done & playing):
+            for name, values in final_numbers(infos, done & playing).items():
                 if name not in ("return", "length"):  # counted above; the environment's own of these names are ignored
-                    metrics.setdefault(name, np.full(len(levels), np.nan))[which] = values
+                    now = np.isfinite(values)
+                    metrics.setdefault(name, np.full(len(levels), np.nan))[now] = values[now]
             playing &= ~done
             if not playing.any():
                 break

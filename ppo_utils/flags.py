@@ -1,9 +1,11 @@
 """Flags of the scripts: their types with bounds, their spelling, and the checks that need no environment."""
 
+import contextlib
 import shlex
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import tyro
+from tyro.constructors import PrimitiveConstructorSpec
 
 from ppo_utils.processes import rank_and_size
 
@@ -28,7 +30,25 @@ class Bounds(NamedTuple):
 def bounded(kind: type, *bounds: float, **more: bool) -> Any:
     """Return the type of a flag with these `Bounds`: --help shows them, and `check_args` enforces them."""
     bounds = Bounds(*bounds, **more)
-    return Annotated[kind, bounds, tyro.conf.arg(metavar=f"{kind.__name__.upper()} ({bounds})")]
+    metavar = f"{kind.__name__.upper()} ({bounds})"
+    if kind is not int:
+        return Annotated[kind, bounds, tyro.conf.arg(metavar=metavar)]
+    return Annotated[int, bounds, PrimitiveConstructorSpec(1, metavar, whole_number, is_whole, lambda n: [str(n)])]
+
+
+def whole_number(text: list[str]) -> int:
+    """Parse an integer, which may be written 1e6 or 1_000_000 too. Raises ValueError for other numbers."""
+    with contextlib.suppress(ValueError):
+        return int(text[0])
+    with contextlib.suppress(ValueError):
+        if (number := float(text[0])).is_integer():
+            return int(number)
+    raise ValueError(f"{text[0]} is no whole number")
+
+
+def is_whole(value: Any) -> bool:
+    """Return whether a default is an integer."""
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 PositiveInt = bounded(int, 1)

@@ -1,11 +1,11 @@
 """Observations of any environment as dicts of pictures and vectors, which is all that the networks take.
 
-Shape letters: N environments, H, W and C of a picture, V of a vector.
+Shape letters: N environments, n some of them, H, W and C of a picture, V of a vector.
 """
 
 import sys
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -13,125 +13,227 @@ import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
+from memory_gym_envs.base import lane_seeds
 from memory_gym_envs.options import brief
-from ppo_utils.wrappers import named, one_hot
+from ppo_utils.processes import RunError
+from ppo_utils.wrappers import OBSERVATION, one_hot
 
 SMALLEST_PICTURE = 36  # pixels along a side; what is smaller becomes a vector
+INFOS = ("own", "ground_truth", "_ground_truth", "final_obs", "_final_obs", "final_info", "_final_info")
 
 
 class ObservationParts(VectorWrapper):
     """Every observation as a dict of named parts, in `final_obs` too: each a picture or a vector.
 
-    The parts of a Dict keep their names and their order; any other observation is one part named "observation".
-    Pictures are Box (H, W, C) with sides of at least 36, uint8, or float32 from 0 to 1; two-dimensional ones get a
-    channel, and channels that come first go last. All else becomes a vector (V,) float32, as Gymnasium's `flatten`
-    makes it: Box of any shape, Discrete and MultiDiscrete (one-hot), MultiBinary, and Tuple and Dict of these.
-    Text is left out, and a line on stderr says so.
+    Dicts and Tuples, at any depth, are taken apart; a part's name is the keys that lead to it, joined by dots. An
+    observation that is neither is one part named "observation". Text is left out, and a line on stderr says so.
 
-    Raises ValueError for other spaces, for pictures of other numbers, and if nothing is left to observe.
+    first_lane: number of the first environment, for error messages.
+
+    Raises ValueError for spaces that are not supported (see `Part.of`), and if nothing is left to observe. Where an
+    environment observes NaN, infinity or what its space does not hold, or earns such a reward, step and reset raise
+    RunError with one line that says which environment, part and step it was. Of infos, only what a training reads is
+    kept.
     """
 
-    def __init__(self, env: VectorEnv):
+    def __init__(self, env: VectorEnv, first_lane: int = 0):
         super().__init__(env)
-        given = named(env.single_observation_space)
-        texts = [name for name, space in given.items() if is_text(space)]
+        space = env.single_observation_space
+        leaves = dict(leaves_of(space)) if isinstance(space, CONTAINERS) else {(OBSERVATION,): space}
+        texts = [name_of(path) for path, leaf in leaves.items() if is_text(leaf)]
         if texts:
             print(f"{env.spec.id}: the text {', '.join(texts)} is left out of the observation", file=sys.stderr)
-        self._convert = {name: converter(name, space) for name, space in given.items() if name not in texts}
-        if not self._convert:
-            raise ValueError(
-                f"the observation space {brief(env.single_observation_space)} is not supported; it is all text"
-            )
-        parts = {name: converted_space(given[name], convert) for name, convert in self._convert.items()}
-        self.single_observation_space = gym.spaces.Dict(parts, sort_keys=False)
+        self._parts = {name_of(path): Part.of(path, leaf) for path, leaf in leaves.items() if not is_text(leaf)}
+        if not self._parts:
+            raise ValueError(f"the observation space {brief(space)} is not supported; it is all text")
+        if len(self._parts) + len(texts) < len(leaves):
+            raise ValueError(f"the observation space {brief(space)} is not supported; two parts have the same name")
+        spaces = {name: part.space() for name, part in self._parts.items()}
+        self.single_observation_space = gym.spaces.Dict(spaces, sort_keys=False)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._first_lane, self._seeds, self._steps = first_lane, [None] * self.num_envs, 0
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Reset the environment, its observations in parts."""
+        if seed is not None:
+            self._seeds, self._steps = lane_seeds(seed, self.num_envs), 0
         observations, infos = self.env.reset(seed=seed, options=options)
-        return self.parts(observations), infos
+        return self._convert(observations), {name: infos[name] for name in INFOS if name in infos}
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], Any, Any, Any, dict[str, Any]]:
         """Step every lane, its observations in parts, those in `final_obs` too."""
+        self._steps += 1
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
-        if "final_obs" in infos:
-            space, final = self.env.single_observation_space, infos["final_obs"]
-            (ended,) = infos["_final_obs"].nonzero()
-            last = self.parts(concatenate(space, final[ended], create_empty_array(space, len(ended))))
+        if not np.isfinite(rewards).all():
+            lane = int(np.flatnonzero(~np.isfinite(rewards))[0])
+            raise self._error(lane, f"the reward is {rewards[lane]}")
+        infos = {name: infos[name] for name in INFOS if name in infos}
+        ended = np.flatnonzero(terminated | truncated)
+        if ended.size:
+            last = self._convert(self._final(infos, ended), ended)
+            infos["final_obs"], infos["_final_obs"] = np.full(self.num_envs, None), terminated | truncated
             for row, lane in enumerate(ended.tolist()):
-                final[lane] = {name: part[row] for name, part in last.items()}
-        return self.parts(observations), rewards, terminated, truncated, infos
+                infos["final_obs"][lane] = {name: part[row] for name, part in last.items()}
+        return self._convert(observations), rewards, terminated, truncated, infos
 
-    def parts(self, observations: Any) -> dict[str, np.ndarray]:
+    def _final(self, infos: dict[str, Any], ended: np.ndarray) -> Any:
+        """Return the last observations of ended episodes, (n,) lanes, as one batch."""
+        space, final = self.env.single_observation_space, infos.get("final_obs")
+        if final is None:
+            raise self._error(int(ended[0]), "an episode ended, and infos have no final_obs")
+        if isinstance(final, np.ndarray) and final.dtype == object:  # as Gymnasium has it: an observation for each lane
+            return concatenate(space, final[ended], create_empty_array(space, len(ended)))
+        return rows_of(final, ended)  # one batch for all lanes
+
+    def _convert(self, observations: Any, lanes: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Return the parts of observations, each (N, ...); no copies of what is right already."""
-        given = named(observations)
-        return {name: convert(given[name]) for name, convert in self._convert.items()}
+        parts = {}
+        for name, part in self._parts.items():
+            try:
+                parts[name] = part.convert(observations)
+            except WrongValue as error:
+                row, what = error.args
+                raise self._error(row if lanes is None else int(lanes[row]), f"{name} {what}") from None
+        return parts
+
+    def _error(self, lane: int, what: str) -> RunError:
+        seed = self._seeds[lane]
+        began = "it was made" if seed is None else f"its reset with seed {seed}"
+        where = f"environment {self._first_lane + lane}, step {self._steps} since {began}"
+        return RunError(f"{self.env.spec.id}: {what} ({where})")
 
 
-def converter(name: str, space: gym.Space) -> Callable[[Any], np.ndarray]:
-    """Return what makes pictures or vectors of a batch of this part of the observations; ValueError if nothing can."""
-    if isinstance(space, gym.spaces.Box):
-        layout = picture_layout(space.shape)
-        if layout is not None and (space.dtype == np.uint8 or (space.low.min() >= 0 and space.high.max() <= 1)):
-            return partial(as_pictures, layout)
-        supported = layout in (None, "HW")  # a matrix of other numbers is no picture
+class WrongValue(Exception):
+    """An observation is not what its space says: the row of a batch, and what is wrong with it."""
+
+
+@dataclass
+class Part:
+    """A part of the observation that is a picture or a vector: where it is, and how it is made."""
+
+    path: tuple[str | int, ...]  # the keys that lead to it
+    leaf: gym.Space  # of the environment
+    axes: tuple[int, int] | None = None  # height and width, if it is a picture
+    bounds: tuple[float, float] = (0, 1)  # of a picture's numbers
+
+    @classmethod
+    def of(cls, path: tuple[str | int, ...], leaf: gym.Space) -> "Part":
+        """Say what becomes of a space that is no Dict or Tuple.
+
+        A Box with bounds and two neighbouring axes of at least 36 is a picture (H, W, C), with all other axes as
+        channels: uint8 if these are bytes from 0 to 255, else float32, scaled from its bounds to 0 to 1. All else is a
+        vector (V,) float32, as Gymnasium's `flatten` makes it: Box, Discrete and MultiDiscrete (one-hot), MultiBinary.
+
+        Raises ValueError for other spaces, and for a picture without bounds.
+        """
+        if isinstance(leaf, gym.spaces.Box):
+            axes = picture_axes(leaf.shape)
+            if axes is None:
+                return cls(path, leaf)
+            bounds = float(leaf.low.min()), float(leaf.high.max())
+            if np.isfinite(bounds).all():
+                return cls(path, leaf, axes, bounds)
+            if len(leaf.shape) == 2:  # a matrix
+                return cls(path, leaf)
+        elif isinstance(leaf, (gym.spaces.Discrete, gym.spaces.MultiDiscrete, gym.spaces.MultiBinary)):
+            return cls(path, leaf)
+        raise ValueError(
+            f"the observation space {name_of(path)}: {brief(leaf)} is not supported; use pictures (height, width, "
+            "channels) with bounds, Box, Discrete, MultiDiscrete, MultiBinary, and Tuple or Dict of these"
+        )
+
+    def space(self) -> gym.spaces.Box:
+        """Return the space of what `convert` returns for one environment."""
+        if self.axes is None:
+            flat = gym.spaces.flatten_space(self.leaf)
+            with np.errstate(over="ignore"):  # bounds beyond float32 become infinite
+                return gym.spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32))
+        shape = self._as_picture(self.leaf.low[None]).shape[1:]
+        return gym.spaces.Box(0, 255, shape, np.uint8) if self._is_bytes else gym.spaces.Box(0, 1, shape, np.float32)
+
+    @property
+    def _is_bytes(self) -> bool:
+        return self.leaf.dtype == np.uint8 and self.bounds == (0, 255)
+
+    def convert(self, observations: Any) -> np.ndarray:
+        """Take this part out of a batch of observations: (n, H, W, C) uint8 or float32, or (n, V) float32.
+
+        Raises WrongValue for NaN, infinity, and numbers that a Discrete or MultiDiscrete space does not have.
+        """
+        values = observations
+        if self.path != (OBSERVATION,) or isinstance(observations, (dict, tuple)):
+            for key in self.path:
+                values = values[key]
+        if self.axes is not None:
+            values = self._as_picture(np.asarray(values))
+            if self._is_bytes:
+                return np.ascontiguousarray(values, np.uint8)
+            low, high = self.bounds
+            return finite(np.ascontiguousarray((values - low) / ((high - low) or 1.0), np.float32))
+        rows = np.reshape(values, (len(values), -1))
+        if isinstance(self.leaf, (gym.spaces.Discrete, gym.spaces.MultiDiscrete)):
+            first = np.ravel(self.leaf.start)
+            sizes = np.ravel(self.leaf.n if isinstance(self.leaf, gym.spaces.Discrete) else self.leaf.nvec)
+            wrong = (rows < first) | (rows >= first + sizes)
+            if wrong.any():
+                row, entry = np.argwhere(wrong)[0].tolist()
+                last = first[entry] + sizes[entry] - 1
+                raise WrongValue(row, f"is {rows[row, entry]}, outside of {first[entry]} to {last}")
+            return one_hot(rows - first, sizes)
+        with np.errstate(over="ignore"):
+            return finite(np.ascontiguousarray(rows, np.float32))
+
+    def _as_picture(self, values: np.ndarray) -> np.ndarray:
+        """Move height and width of (n, ...) to the front, and join all other axes as channels: (n, H, W, C)."""
+        height, width = self.axes
+        moved = np.moveaxis(values, (height + 1, width + 1), (1, 2))
+        return moved.reshape(*moved.shape[:3], -1)
+
+
+CONTAINERS = (gym.spaces.Dict, gym.spaces.Tuple)
+
+
+def leaves_of(space: gym.Space, path: tuple = ()) -> Iterator[tuple[tuple[str | int, ...], gym.Space]]:
+    """Yield the spaces inside Dicts and Tuples, in their order, each with the keys that lead to it."""
+    if isinstance(space, CONTAINERS):
+        inside = space.spaces if isinstance(space, gym.spaces.Dict) else dict(enumerate(space.spaces))
+        for key, each in inside.items():
+            yield from leaves_of(each, (*path, key))
     else:
-        supported = is_flattenable(space)
-    if supported:
-        return partial(as_vectors, space)
-    raise ValueError(
-        f"the observation space {name}: {brief(space)} is not supported; use pictures (height, width, "
-        "channels) of bytes or of numbers from 0 to 1, Box, Discrete, MultiDiscrete, MultiBinary, Tuple or Dict"
-    )
+        yield path, space
 
 
-def converted_space(space: gym.Space, convert: Callable[[Any], np.ndarray]) -> gym.spaces.Box:
-    """Return the space of what `converter` makes of one observation from this space."""
-    with np.errstate(over="ignore"):  # bounds beyond float32 become infinite
-        if convert.func is as_vectors:
-            flat = gym.spaces.flatten_space(space)
-            return gym.spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32))
-        low, high = (convert(bound[None])[0] for bound in (space.low, space.high))
-        return gym.spaces.Box(low, high, dtype=low.dtype)
+def name_of(path: tuple[str | int, ...]) -> str:
+    """Return a part's name."""
+    return ".".join(map(str, path))
 
 
-def picture_layout(shape: tuple[int, ...]) -> str | None:
-    """Return which axes of a Box are a picture's: height, width and channels; None if it is too small to be one."""
-    large = tuple(side >= SMALLEST_PICTURE for side in shape)
-    layouts = {(True, True): "HW", (True, True, False): "HWC", (True, True, True): "HWC", (False, True, True): "CHW"}
-    return layouts.get(large)
+def picture_axes(shape: tuple[int, ...]) -> tuple[int, int] | None:
+    """Return which axes are height and width, two neighbours of at least 36 pixels; None if there are none.
+
+    A third large axis counts as channels if it comes last.
+    """
+    large = [axis for axis, side in enumerate(shape) if side >= SMALLEST_PICTURE]
+    if len(shape) == len(large) == 3:
+        large.pop()
+    return tuple(large) if len(large) == 2 and len(shape) <= 4 and large[1] - large[0] == 1 else None
 
 
-def as_pictures(layout: str, values: np.ndarray) -> np.ndarray:
-    """Return a batch of pictures in this layout as (N, H, W, C), bytes or float32."""
-    if layout == "HW":
-        values = values[..., None]
-    elif layout == "CHW":
-        values = np.moveaxis(values, 1, -1)
-    return np.ascontiguousarray(values, np.uint8 if values.dtype == np.uint8 else np.float32)
+def finite(values: np.ndarray) -> np.ndarray:
+    """Return values (n, ...); raise WrongValue if one is NaN or infinite."""
+    if not np.isfinite(values).all():
+        index = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
+        raise WrongValue(index[0], f"has an entry {values[index]}")
+    return values
 
 
-def as_vectors(space: gym.Space, values: Any) -> np.ndarray:
-    """Return what Gymnasium's `flatten` makes of each of a batch of observations, (N, V) float32, all lanes at once."""
-    if isinstance(space, gym.spaces.Dict):
-        return np.concatenate([as_vectors(part, values[name]) for name, part in space.spaces.items()], axis=1)
-    if isinstance(space, gym.spaces.Tuple):
-        return np.concatenate([as_vectors(*each) for each in zip(space.spaces, values, strict=True)], axis=1)
-    rows = np.reshape(values, (len(values), -1))
-    if isinstance(space, gym.spaces.Discrete):
-        return one_hot(rows - space.start, np.array([space.n]))
-    if isinstance(space, gym.spaces.MultiDiscrete):
-        return one_hot(rows - space.start.ravel(), space.nvec.ravel())
-    return np.ascontiguousarray(rows, np.float32)
-
-
-def is_flattenable(space: gym.Space) -> bool:
-    """Return whether `as_vectors` knows the space, and what is in it."""
-    if isinstance(space, (gym.spaces.Dict, gym.spaces.Tuple)):
-        inside = list(named(space).values()) if isinstance(space, gym.spaces.Dict) else space.spaces
-        return bool(inside) and all(map(is_flattenable, inside))
-    known = gym.spaces.Box, gym.spaces.Discrete, gym.spaces.MultiDiscrete, gym.spaces.MultiBinary
-    return isinstance(space, known)
+def rows_of(observations: Any, rows: np.ndarray) -> Any:
+    """Return some rows of a batch of observations, in dicts and tuples too."""
+    if isinstance(observations, dict):
+        return {name: rows_of(part, rows) for name, part in observations.items()}
+    if isinstance(observations, tuple):
+        return tuple(rows_of(part, rows) for part in observations)
+    return np.asarray(observations)[rows]
 
 
 def is_text(space: gym.Space) -> bool:

@@ -7,6 +7,8 @@ each iteration. `run_to_end` calls `train`; `command` calls `setup`, then `run_t
 import argparse
 import contextlib
 import fcntl
+import functools
+import math
 import os
 import random
 import re
@@ -132,8 +134,11 @@ def seed_generators(seed: int) -> None:
 
 
 @contextlib.contextmanager
-def report_out_of_memory(args: Any, device: torch.device) -> Iterator[None]:
-    """Raise ValueError, naming the flags above their defaults, if what is made inside does not fit in the memory."""
+def report_out_of_memory(args: Any, device: torch.device, space: gym.spaces.Dict | None = None) -> Iterator[None]:
+    """Raise ValueError if what is made inside does not fit in the memory, naming what is large.
+
+    That are flags above their defaults, and the observation, of this space, if it takes megabytes.
+    """
     try:
         yield
     except (MemoryError, RuntimeError) as error:
@@ -144,6 +149,9 @@ def report_out_of_memory(args: Any, device: torch.device) -> Iterator[None]:
         sizes = [each for each in fields(args) if type(each.default) is int and each.name not in harmless]
         large = [each.name for each in sizes if getattr(args, each.name) > each.default] or ["num_envs", "num_steps"]
         large = " ".join(f"{flag(name)} {getattr(args, name)}" for name in large)
+        bytes_of = [part.dtype.itemsize * math.prod(part.shape) for part in space.values()] if space else []
+        if sum(bytes_of) > 1e6:
+            large = f"the observation, {sum(bytes_of) / 1e6:.0f} MB each time; or of {large}"
         raise ValueError(f"this does not fit in the memory of {device}; use less of {large}") from None
 
 
@@ -286,9 +294,18 @@ def level_scores(args: Any, run: Run) -> dict[str, torch.Tensor]:
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(args.seed)
         levels = evaluation_levels(args, args.eval_levels)
-        metrics = evaluate(run.agent, run.eval_envs, levels, args.eval_max_steps, args.amp)
-    complete = {name: torch.from_numpy(values) for name, values in metrics.items() if not np.isnan(values).any()}
+        metrics = evaluate(run.agent, run.eval_envs, levels, args.eval_max_steps, amp=args.amp)
+    missing = {name: int(np.isnan(values).sum()) for name, values in metrics.items()}
+    for name in filter(missing.get, metrics):
+        tell_left_out(name, missing[name], len(levels))
+    complete = {name: torch.from_numpy(values) for name, values in metrics.items() if not missing[name]}
     return {name: values.unflatten(0, (-1, REPEATS)) for name, values in complete.items()}
+
+
+@functools.cache
+def tell_left_out(name: str, missing: int, episodes: int) -> None:
+    """Say, once, that evaluations leave a metric out."""
+    print(f"\nevaluations leave out {name}: {missing} of {episodes} episodes do not report it", file=sys.stderr)
 
 
 def write_logs(args: Any, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
@@ -299,7 +316,11 @@ def write_logs(args: Any, run: Run, logs: dict[str, float], episodes: dict[str, 
     run.lengths.extend(episodes.get("charts/episodic_length", []))
     if run.writer is None:
         return
-    logs |= {name: float(np.mean(values)) for name, values in episodes.items()}
+    ended = len(episodes.get("charts/episodic_return", []))
+    for name, values in episodes.items():
+        logs[name] = float(np.mean(values))
+        if len(values) < ended:  # a metric that not all of them report
+            logs[f"{name}_count"] = len(values)
     logs["charts/SPS"] = run.step / run.seconds
     for name, value in logs.items():
         run.writer.add_scalar(name, value, run.step)

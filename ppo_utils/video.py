@@ -1,67 +1,128 @@
 """Videos of the first environment while an agent trains."""
 
 import importlib
-import warnings
+import sys
+from collections.abc import Generator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import SyncVectorEnv, VectorEnv
-from gymnasium.wrappers.vector import RecordVideo
+from gymnasium.vector import SyncVectorEnv, VectorEnv, VectorWrapper
 
 from memory_gym_envs.base import MemoryGymVectorEnv
+from memory_gym_envs.options import brief
 from memory_gym_envs.saving import Saved
-from ppo_utils.environments import creator, find_spec
+from ppo_utils.environments import find_spec
+from ppo_utils.lanes import creator
 
 MAX_VIDEO_FRAMES = 1000
 
 
-class LaneVideo(Saved, RecordVideo):
-    """Videos of lane 0: of the episodes that Gymnasium's capped cubic schedule picks (0, 1, 8, 27, ...).
+class LaneVideo(Saved, VectorWrapper):
+    """Videos of lane 0: of episodes 0, 1, 8, 27, ..., all cubes up to 1,000, then every thousandth.
 
-    env: has been reset; its present episode is number 0. folder: is made if it is not there.
-    A video shows every observation that was acted on, up to the first 1,000. What is being recorded is written by
-    close(). Its state is the numbers of the episode and the step.
+    env: its present episode is number 0. folder: is made with the first video.
+    A video shows every observation that was acted on, one frame each, up to the first 1,000. One that cannot be written
+    costs itself and a line on stderr, never the run. Its state is the number of the episode.
     """
 
-    kept = ("episode_id", "step_id")
+    kept = ("episode",)
 
     def __init__(self, env: VectorEnv, folder: str):
-        with warnings.catch_warnings():
-            # That the observation after an episode's last action is missing, and that the folder is there already.
-            warnings.simplefilter("ignore")
-            super().__init__(env, folder, record_first_only=True)
-        self.episode_id = 0
-        self.start_recording(f"{self.name_prefix}-episode-0")
-        self._capture_frame()
+        super().__init__(env)
+        self.folder, self.episode, self.frames, self.recording = Path(folder), 0, 0, True
+        self.fps = float(env.metadata.get("render_fps") or 30)
+        self.writer: Generator | None = None  # takes frames, from an episode's first one on
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Take over the number of the episode, of which the beginning is missing: it has no video."""
         super().set_state(state)
-        self.recording, self.recorded_frames = False, []
+        self._end()
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], Any, Any, Any, dict[str, Any]]:
-        """Step every lane; a video that is long enough ends here."""
-        result = super().step(actions)
-        if self.recording and len(self.recorded_frames) >= MAX_VIDEO_FRAMES:
-            self.stop_recording()
+        """Film what lane 0 acts on, and step every lane."""
+        if self.recording:
+            self._film()
+        result = self.env.step(actions)
+        _, _, terminated, truncated, _ = result
+        if terminated[0] or truncated[0]:
+            self._end()
+            self.episode, self.frames = self.episode + 1, 0
+            self.recording = self.episode % 1000 == 0 or round(self.episode ** (1 / 3)) ** 3 == self.episode
         return result
 
-    def _capture_frame(self) -> None:
-        """Keep lane 0's picture; Gymnasium's own method has all lanes draw theirs."""
+    def close(self, **kwargs: Any) -> None:
+        """Close the video that is being recorded, and the environments."""
+        self._end()
+        super().close(**kwargs)
+
+    def _film(self) -> None:
+        """Write lane 0's picture; Gymnasium's own method has all lanes draw theirs."""
         envs = self.unwrapped
-        if isinstance(envs, MemoryGymVectorEnv):
-            (picture,) = envs.render(np.zeros(1, np.intp))
-        else:
-            picture = envs.envs[0].render() if isinstance(envs, SyncVectorEnv) else envs.render()[0]
-        self.recorded_frames.append(picture)
+        try:
+            if isinstance(envs, MemoryGymVectorEnv):
+                (frame,) = envs.render(np.zeros(1, np.intp))
+            else:
+                frame = envs.envs[0].render() if isinstance(envs, SyncVectorEnv) else envs.render()[0]
+            picture = as_picture(frame)
+            if self.writer is None:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                self.writer = video_writer(self.folder / f"episode-{self.episode}.mp4", picture.shape, self.fps)
+                self.shape = picture.shape
+            if picture.shape != self.shape:
+                raise ValueError(f"its pictures change their size, from {self.shape} to {picture.shape}")
+            self.writer.send(even(picture))
+            self.frames += 1
+            if self.frames == MAX_VIDEO_FRAMES:
+                self._end()
+        except Exception as error:  # of the environment, ffmpeg or the disk
+            self._end()
+            what = " ".join(str(error).split()) or repr(error)
+            print(f"the video of episode {self.episode} ends after {self.frames} frames: {what}", file=sys.stderr)
+
+    def _end(self) -> None:
+        writer, self.writer, self.recording = self.writer, None, False
+        if writer is not None:
+            writer.close()
+
+
+def video_writer(path: Path, shape: tuple[int, ...], fps: float) -> Generator:
+    """Return what takes pictures of this shape, made `even`, and writes each as a frame of an H.264 video."""
+    imageio_ffmpeg = importlib.import_module("imageio_ffmpeg")  # of the extra `play`
+    size = tuple(side + side % 2 for side in (shape[1], shape[0]))
+    writer = imageio_ffmpeg.write_frames(str(path), size, fps=fps, macro_block_size=1, ffmpeg_log_level="error")
+    writer.send(None)
+    return writer
+
+
+def even(picture: np.ndarray) -> np.ndarray:
+    """Return a picture (H, W, 3) with even height and width, as H.264 needs: the last row and column are repeated."""
+    height, width, _ = picture.shape
+    return np.ascontiguousarray(np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))
+
+
+def as_picture(frame: Any) -> np.ndarray:
+    """Return a rendered frame as bytes (H, W, 3): of bytes or of floats from 0 to 1, gray or in color, of a list too.
+
+    Raises ValueError for what is no picture.
+    """
+    picture = np.asarray(frame) if frame is not None else np.zeros(0)
+    if picture.ndim == 2:
+        picture = picture[..., None]
+    if picture.ndim != 3 or picture.shape[2] not in (1, 3, 4) or 0 in picture.shape or picture.dtype.kind not in "biuf":
+        raise ValueError(f"render() returned no picture (height, width, 3), but {brief(frame)}")
+    if picture.dtype.kind in "bf" and picture.max() <= 1:
+        picture = picture * 255.0
+    picture = np.clip(np.nan_to_num(picture), 0, 255).astype(np.uint8)
+    return np.repeat(picture, 3, 2) if picture.shape[2] == 1 else picture[..., :3]
 
 
 def check_can_film(env_id: str) -> None:
     """Raise ImportError without the extra `play`, ValueError if the environment says that it draws no pictures."""
     try:
-        importlib.import_module("moviepy")
+        importlib.import_module("imageio_ffmpeg")
     except ImportError:
-        raise ImportError('--capture-video needs moviepy: pip install -e ".[play]"') from None
+        raise ImportError('--capture-video needs imageio-ffmpeg: pip install -e ".[play]"') from None
     check_draws("--capture-video", env_id)
 
 

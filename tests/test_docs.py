@@ -276,12 +276,12 @@ def test_page_names_the_curves(tiny, scalars):
         logged |= set(scalars(script.main(tiny(script, **changes))))
     logged = {re.sub("^(episode|eval)/.*", r"\1/NAME", name) for name in logged} | {"eval_levels/NAME"}
     named = {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
-    assert named == logged
+    assert named == logged | {"episode/NAME_count"}  # which only environments of others need
 
 
 def test_page_plays_an_agent(monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
-    source = re.search(r"```python\n(.*?)```", (ROOT / "docs/logging.md").read_text(), re.DOTALL).group(1)
+    source = re.search(r"```python\n(.*?)```", (ROOT / "docs/agents.md").read_text(), re.DOTALL).group(1)
     torch.manual_seed(1)
     exec(source, {})
     assert 0 < float(capsys.readouterr().out.split()[-1]) <= 1

@@ -549,6 +549,45 @@ def test_scores_are_those_of_the_levels(agents, capsys):
     assert len({tuple(level) for level in falls[0]}) > 1, "levels that can be told apart"
 
 
+def scores_of(agents, metric="num_fails", **changes):
+    """A metric (M, E) of an agent's episodes, and the title of what it played."""
+    evaluate.main(evaluate.Config((f"{agents[0]}/model.pt",), json="scores.json", **{**FEW, **changes}))
+    (task,) = json.loads(Path("scores.json").read_text())
+    return np.array(task["agents"][0]["metrics"][metric]["scores"][0]), task["task"]
+
+
+def test_the_most_probable_actions(agents):
+    """They are the same in each repeat, and no seed changes them."""
+    sampled, _ = scores_of(agents, repeats=6)
+    assert (sampled != sampled[:, :1]).any()
+    chosen, title = scores_of(agents, repeats=6, deterministic=True)
+    assert (chosen == chosen[:, :1]).all()
+    assert np.array_equal(chosen, scores_of(agents, repeats=6, deterministic=True, seed=9)[0])
+    assert title.endswith("levels 15 to 18, 6 times each, most probable actions")
+
+
+def test_other_levels(agents):
+    usual, _ = scores_of(agents, levels=6, deterministic=True)
+    moved, title = scores_of(agents, levels=4, deterministic=True, start_level=17)
+    assert np.array_equal(usual[2:], moved)
+    assert ", levels 17 to 20, " in title
+    assert ", levels 12 to 15 (of its training), " in scores_of(agents, start_level=12)[1]
+    assert ", levels 1 to 4, " in scores_of(agents, start_level=1)[1], "below the first level of the training"
+
+
+def test_reset_options_over_those_of_the_training(tiny):
+    trained = tiny(env_id="MysteryPath-Grid-v0", env_options='{"max_steps": 30, "show_goal": true}', save_model=True)
+    agents = [str(ppo_gru.main(trained))]
+    few = {"max_steps": 10_000, "levels": 4}
+    assert scores_of(agents, "length", **few)[0].max() == 30
+    lengths, title = scores_of(agents, "length", env_options='{"max_steps": 20}', **few)
+    assert lengths.max() == 20
+    assert title.startswith('MysteryPath-Grid-v0 {"max_steps": 20, "show_goal": true}, ')
+    for wrong, message in (("[", "--env-options is no JSON"), ('{"max_step": 3}', "max_steps")):
+        with pytest.raises(ValueError, match=message):
+            scores_of(agents, env_options=wrong)
+
+
 def test_a_checkpoint_is_read_once(agents, monkeypatch):
     read, read_bytes = [], Path.read_bytes
     monkeypatch.setattr(Path, "read_bytes", lambda path: (read.append(str(path)), read_bytes(path))[1])

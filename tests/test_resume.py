@@ -272,7 +272,7 @@ def test_a_checkpoint_holds_what_the_next_rollout_begins_with(tiny):
 
 
 def test_videos_go_on(tiny, monkeypatch):
-    pytest.importorskip("moviepy")
+    pytest.importorskip("imageio_ffmpeg")
     args = tiny(env_id="MortarMayhemB-Grid-v0", total_timesteps=8 * 64, capture_video=True)
     whole = ppo_gru.main(args)
     folder = interrupted(monkeypatch, ppo_gru, args, 2)

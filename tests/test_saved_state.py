@@ -224,7 +224,7 @@ def test_every_generator_of_numpy(kind):
 
 
 def test_a_video_starts_again_with_the_next_scheduled_episode(tmp_path):
-    pytest.importorskip("moviepy")
+    pytest.importorskip("imageio_ffmpeg")
 
     def filmed(folder):
         envs = make_envs("MortarMayhemB-Grid-v0", LANES, render_mode="rgb_array")
@@ -233,16 +233,16 @@ def test_a_video_starts_again_with_the_next_scheduled_episode(tmp_path):
 
     envs = filmed("before")
     still = np.zeros((LANES, 1), np.int64)
-    while envs.episode_id < 2:
+    while envs.episode < 2:
         envs.step(still)
     state = save_state(envs)
     envs.close()
     again = filmed("after")
     load_state(again, through_a_file(state))
-    while again.episode_id < 9:
+    while again.episode < 9:
         again.step(still)
     again.close()
-    assert [path.name for path in (tmp_path / "after").iterdir()] == ["rl-video-episode-8.mp4"]
+    assert [path.name for path in (tmp_path / "after").iterdir()] == ["episode-8.mp4"]
 
 
 # ---- what does not fit ----

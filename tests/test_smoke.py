@@ -342,7 +342,7 @@ def test_save_and_load(tiny, opened, memory):
 
 
 def test_capture_video(tiny):
-    pytest.importorskip("moviepy")
+    pytest.importorskip("imageio_ffmpeg")
     folder = ppo_gru.main(tiny(env_id="MortarMayhemB-Grid-v0", capture_video=True))
     videos = glob.glob(os.path.join(folder, "videos", "*.mp4"))
     assert len(videos) >= 2
@@ -450,7 +450,7 @@ def test_command_line(tmp_path, script, width):
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_the_script_needs_no_extra(script):
     """What only an extra brings must not be imported with the script."""
-    extras = ("moviepy", "wandb", "pygame", "matplotlib", "pytest")
+    extras = ("imageio_ffmpeg", "wandb", "pygame", "matplotlib", "pytest")
     code = f"import sys; sys.modules.update(dict.fromkeys({extras})); import {script.__name__}"
     subprocess.run([sys.executable, "-c", code], cwd=os.path.dirname(script.__file__), check=True, timeout=300)
 

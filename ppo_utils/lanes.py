@@ -1,0 +1,152 @@
+"""The environments of one id, side by side: made, stepped and reset together, each with seeds and errors of its own.
+
+A lane is one of the N environments that step together.
+"""
+
+import contextlib
+import copy
+import functools
+import inspect
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec, load_env_creator
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+
+OWN = "own"  # where an info has what a lane's own info was
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Seeds that resets take: count of them, from first; without count, resets take none."""
+
+    first: int = 0
+    count: int = 0
+
+
+class Lane(gym.Wrapper):
+    """One environment of several. What its step or reset raises says which one it was and how to get there again.
+
+    Errors become the cause of a RuntimeError, whose message has the number of the lane, the seed that the environment
+    was last reset with, and the number of the step since then.
+
+    A reset without a seed takes one of the levels, if there are any; which ones depends on the last seed that was
+    given. The last observation of an episode is a copy, since some environments return the same array at every step.
+    Infos are one object each, which Gymnasium does not try to make arrays of: its arrays have the type of the value
+    that comes first.
+    """
+
+    def __init__(self, env: gym.Env, number: int, levels: Levels):
+        super().__init__(env)
+        self._number, self._levels = number, levels
+        self._seed, self._steps, self._rng = None, 0, np.random.default_rng()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the environment. Raises RuntimeError for what it raises."""
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+        elif self._levels.count:
+            seed = self._levels.first + int(self._rng.integers(self._levels.count))
+        if seed is not None:
+            self._seed, self._steps = seed, 0
+        try:
+            observation, info = self.env.reset(seed=seed, options=options)
+        except Exception as error:
+            raise self._located(error, "the reset after step") from error
+        return observation, {OWN: (dict(info),)}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the environment. Raises RuntimeError for what it raises."""
+        self._steps += 1
+        try:
+            observation, reward, terminated, truncated, info = self.env.step(action)
+        except Exception as error:
+            raise self._located(error, "step") from error
+        if terminated or truncated:
+            observation = copy.deepcopy(observation)
+        return observation, reward, terminated, truncated, {OWN: (dict(info),)}
+
+    def _located(self, error: Exception, where: str) -> RuntimeError:
+        began = "it was made, never reset with a seed" if self._seed is None else f"its reset with seed {self._seed}"
+        what = f"{type(error).__name__} in {where} {self._steps} since {began}"
+        return RuntimeError(": ".join(filter(None, [f"environment {self._number} raised {what}", one_line(error)])))
+
+
+def same_step_envs(
+    spec: EnvSpec, num_envs: int, kwargs: dict[str, Any], first_lane: int, levels: Levels, asynchronous: bool
+) -> VectorEnv:
+    """Make the id's own vector environment if it resets in the same step, else lanes one after the other, or at once.
+
+    Raises ValueError if there is no environment that resets in the same step, and for kwargs that it does not take.
+    """
+    own = spec.vector_entry_point
+    if own is not None and (spec.entry_point is None or resets_in_same_step(creator(own))) and not asynchronous:
+        check_kwargs(spec.id, creator(own), kwargs)
+        envs = gym.make_vec(spec.id, num_envs, vectorization_mode="vector_entry_point", **kwargs)
+        if not resets_in_same_step(envs):
+            raise ValueError(f"{spec.id} does not reset an ended episode in the same step")
+        return envs
+    if spec.entry_point is None:
+        raise ValueError(f"{spec.id} has no single environments, which --async-envs needs")
+    check_kwargs(spec.id, creator(spec.entry_point), kwargs)
+    make = functools.partial(make_lane, spec, kwargs, levels, asynchronous)
+    kind = AsyncVectorEnv if asynchronous else SyncVectorEnv
+    lanes = [functools.partial(make, first_lane + lane) for lane in range(num_envs)]
+    more = {"shared_memory": False} if asynchronous else {}  # which not all spaces can have
+    envs = kind(lanes, autoreset_mode=AutoresetMode.SAME_STEP, **more)
+    envs.spec = spec
+    return envs
+
+
+def make_lane(spec: EnvSpec, kwargs: dict[str, Any], levels: Levels, asynchronous: bool, number: int) -> Lane:
+    """Make one environment, in a process of its own if asynchronous."""
+    if asynchronous:  # Ctrl-C reaches all processes, and it is the first one that stops the training
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return Lane(gym.make(spec, **kwargs), number, levels)
+
+
+def check_kwargs(env_id: str, create: Callable, kwargs: dict[str, Any]) -> None:
+    """Raise ValueError if the environment's constructor does not take an argument; render_mode is Gymnasium's."""
+    try:
+        parameters = inspect.signature(create).parameters
+    except ValueError:  # of a class that is not written in Python
+        return
+    if any(each.kind is inspect.Parameter.VAR_KEYWORD for each in parameters.values()):
+        return
+    taken = [name for name in parameters if name not in ("self", "render_mode")]
+    for name in kwargs.keys() - {*taken, "render_mode"}:
+        raise ValueError(f"{env_id} has no argument {name!r}; it has {', '.join(taken) or 'none'}")
+
+
+def creator(entry_point: str | Callable) -> Callable:
+    """Return what makes the environment: its class, as a rule."""
+    return load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+
+
+def resets_in_same_step(envs: Any) -> bool:
+    """Return whether the metadata of an environment, or of its class, says so."""
+    return getattr(envs, "metadata", {}).get("autoreset_mode") == AutoresetMode.SAME_STEP
+
+
+@contextlib.contextmanager
+def one_line_errors(what: str) -> Iterator[None]:
+    """Turn what an environment raises into a ValueError of one line that begins with what failed.
+
+    Errors whose cause is the machine or the installation stay as they are.
+    """
+    try:
+        yield
+    except Exception as error:
+        first = error.__cause__ if isinstance(error, RuntimeError) and error.__cause__ else error  # see Lane
+        if isinstance(first, (gym.error.Error, ImportError, OSError, MemoryError)):
+            raise first from None
+        raise ValueError(f"{what}: {one_line(error) or repr(error)}") from error
+
+
+def one_line(error: Exception) -> str:
+    """Return the error's message without line breaks; empty if it has none."""
+    return " ".join(str(error).split())

@@ -1,0 +1,126 @@
+"""ppo_utils.acting: an agent from a file, in a loop of one's own, acts as in its training and its evaluation."""
+
+import re
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT, SCRIPTS
+from test_environments import shows
+
+import ppo_gru
+import ppo_trxl
+from ppo_utils import acting
+from ppo_utils.acting import Player
+from ppo_utils.environments import envs_for
+from ppo_utils.evaluation import evaluate
+from ppo_utils.processes import RunError
+
+EVERYTHING = {"frame_stack": 3, "step_encoding": True, "observe_last_action": True}
+NESTED = shows(
+    gym.spaces.Dict({"a": gym.spaces.Tuple((gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(3)))}),
+    action_space=gym.spaces.MultiDiscrete([2, 3], start=[5, 0]),
+)
+TASKS = [
+    ("MysteryPath-Grid-v0", {}),
+    ("MortarMayhemB-v0", EVERYTHING),
+    ("CartPole-v1", {**EVERYTHING, "ground_truth_coef": 0.0}),
+    (NESTED, {"observe_last_action": True}),
+]
+
+
+@pytest.fixture
+def trained(tiny):
+    """Train an agent for one iteration, its heads' weights times `scale`; return the path of its model."""
+
+    def train(script, scale=3, **changes):
+        path = script.main(tiny(script, total_timesteps=64, save_model=True, **changes)) / "model.pt"
+        saved = torch.load(path, weights_only=True)
+        for name, weight in saved["weights"].items():
+            if name.startswith("heads."):
+                weight.mul_(scale)  # the policy then depends on what it sees
+        torch.save(saved, path)
+        return path
+
+    return train
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+@pytest.mark.parametrize("script", SCRIPTS)
+@pytest.mark.parametrize(("env_id", "changes"), TASKS)
+def test_it_acts_as_in_an_evaluation(trained, script, env_id, changes, deterministic, monkeypatch):
+    """The same episodes in single environments as in one lane of a vector environment, over two of them."""
+    monkeypatch.setattr(acting, "MEMORY_STEPS", 5)  # fewer than an episode has
+    player, env = Player(trained(script, env_id=env_id, **changes), deterministic), gym.make(env_id)
+    for seed in (3, 8):
+        torch.manual_seed(seed)
+        expected = evaluate(player.agent, envs_for(player.args, 1), [seed], 100, deterministic=deterministic)
+        torch.manual_seed(seed)
+        observation, _ = env.reset(seed=seed)
+        player.reset()
+        rewards, done = [], False
+        while not done and len(rewards) < 100:
+            action = player.act(observation, rewards[-1] if rewards else 0.0)
+            assert action in env.action_space
+            observation, reward, terminated, truncated, _ = env.step(action)
+            rewards.append(reward)
+            done = terminated or truncated
+        assert (sum(rewards), len(rewards)) == (pytest.approx(expected["return"][0]), expected["length"][0])
+
+
+def test_auxiliary_heads_do_not_act(trained):
+    path = trained(ppo_gru, env_id="MysteryPath-Grid-v0", ground_truth_coef=0.1, reconstruction_coef=0.1)
+    player = Player(path)
+    observation, _ = gym.make("MysteryPath-Grid-v0").reset(seed=1)
+    assert type(player.act(observation)) is int
+
+
+def test_an_observation_that_is_not_of_the_space(trained):
+    player = Player(trained(ppo_gru, env_id="CartPole-v1"))
+    with pytest.raises(RunError, match="CartPole-v1: observation has an entry nan"):
+        player.act(np.full(4, np.nan, np.float32))
+
+
+def test_an_observation_of_another_space(trained):
+    player = Player(trained(ppo_gru, env_id="MysteryPath-Grid-v0", obs_type="vector"))
+    for wrong in (np.zeros((84, 84, 3), np.uint8), {"a": 1}, None):
+        with pytest.raises(
+            ValueError, match="MysteryPath-Grid-v0: this is no observation of Box.*'s obs_type"
+        ):
+            player.act(wrong)
+
+
+def code_of(page):
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.S)
+
+
+@pytest.mark.parametrize(("script", "changes"), [
+    (ppo_gru, {}), (ppo_gru, {"num_layers": 2}), (ppo_gru, {"memory": "lstm"}), (ppo_trxl, {}),
+    (ppo_trxl, {"trxl_positional_encoding": "relative"}), (ppo_trxl, {"trxl_positional_encoding": "learned"}),
+    (ppo_trxl, {"trxl_gate": "gru", "trxl_query_output": True, "trxl_query_position": True, "trxl_layer_norm": "post"}),
+])  # fmt: skip
+def test_a_step_is_exported_as_documented(trained, script, changes, monkeypatch):
+    """Over 20 steps of two episodes, a window of 7 included: the agent's own logits and values, to 1e-6."""
+    (_, gru, trxl) = code_of("docs/agents.md")
+    names = {"path": str(trained(script, 1, env_id="MysteryPath-Grid-v0", **changes))}
+    exec(gru if script is ppo_gru else trxl, names)
+    agent, step, state = names["player"].agent, names["exported"].module(), names["beginning"]
+    memory = agent.memory.initial_state(1, 64, torch.device("cpu"))
+    envs = envs_for(names["player"].args, 1)
+    obs, _ = envs.reset(seed=1)
+    for t in range(40):
+        obs = {name: torch.from_numpy(part) for name, part in obs.items()}
+        with torch.no_grad():
+            y, hidden = agent.memory.step(memory, agent.encoder(obs))
+            agent.memory.advance(memory, hidden)
+            logits, value, _ = agent.heads(y)
+            found_logits, found_value, *state = step(obs, *state)
+        assert found_logits == pytest.approx(logits, abs=1e-6), t
+        assert found_value == pytest.approx(value, abs=1e-6), t
+        obs, *_ = envs.step(np.array([[t % 4]]))
+        if t == 25:  # a new episode: the state begins as it did
+            agent.memory.reset(memory, torch.tensor([True]))
+            state = names["beginning"]
+    assert Path("step.pt2").exists()

@@ -1,0 +1,528 @@
+"""Environments of other packages: whatever they show and say is right in the numbers, or one line says what is wrong.
+
+Lanes of the small environments here know their number: they are made in order.
+"""
+
+import itertools
+import os
+import sys
+
+import gymnasium as gym
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from conftest import SCRIPTS, parse_args
+from gymnasium.vector import AutoresetMode
+from test_environments import box, register, roll
+
+import ppo_gru
+from ppo_utils import environments, evaluation, runs
+from ppo_utils.environments import env_actions, envs_for, final_numbers, find_spec, ground_truth_of, make_envs
+from ppo_utils.processes import RunError
+from ppo_utils.video import LaneVideo, as_picture, even, video_writer
+
+EACH_SCRIPT = pytest.mark.parametrize("script", SCRIPTS)
+NUMBER = box(-np.inf, np.inf, (1,))
+
+
+class Small(gym.Env):
+    """An environment whose every step is what functions of it return: of `number` (its lane), `episode` and `t`.
+
+    All functions are arguments, so that a test can say in a line what is odd about its environment.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, count=None, space=NUMBER, length=3, see=None, earn=None, tell=None, draw=None, render_mode=None):
+        self.number = next(count) if count else 0
+        self.observation_space, self.action_space = space, gym.spaces.Discrete(2)
+        self.length, self.see, self.earn, self.tell, self.draw = length, see, earn, tell, draw
+        self.render_mode, self.episode, self.seeds = render_mode, -1, []
+
+    def _now(self):
+        observation = np.full(1, self.t, np.float32) if self.see is None else self.see(self)
+        return observation, {} if self.tell is None else self.tell(self)
+
+    def reset(self, *, seed=None, options=None):
+        self.seeds.append(seed)
+        self.episode, self.t, self.ended = self.episode + 1, 0, False
+        return self._now()
+
+    def step(self, action):
+        self.action, self.t = action, self.t + 1
+        self.ended = self.t == (self.length(self) if callable(self.length) else self.length)
+        observation, info = self._now()
+        return observation, 1.0 if self.earn is None else self.earn(self), self.ended, False, info
+
+    def render(self):
+        return self.draw(self)
+
+
+def small(**arguments):
+    return register(lambda **more: Small(**arguments, **more))
+
+
+def lanes(envs):
+    return [each.unwrapped for each in envs.unwrapped.envs]
+
+
+# ---- numbers ----
+KINDS = [0, 0.5, True, np.float32(2.5), np.array([3.0]), 10**30, np.int64(7), torch.tensor(1.5)]
+NO_NUMBERS = [None, "text", np.zeros(2), [1, 2], {"a": 1}, float("nan"), 10**400]
+
+
+@pytest.mark.parametrize("order", [1, -1, 3], ids=["as they are", "backwards", "rotated"])
+def test_a_metric_is_what_each_lane_said(order, capfd):
+    """Gymnasium makes an array of the first lane's type, in which 0.5 after 0 is 0, and 3 after False is True."""
+    environments.tell_left_out.cache_clear()
+    kinds = [*KINDS, *NO_NUMBERS]
+    kinds = kinds[order:] + kinds[:order] if order > 1 else kinds[::order]
+    env_id = small(count=itertools.count(), tell=lambda env: {"score": kinds[env.number]} if env.ended else {})
+    envs = make_envs(env_id, len(kinds), seed=1)
+    envs.reset()
+    *_, infos = [*roll(envs, 3)][-1]
+    found = final_numbers(infos, np.ones(len(kinds), bool))["score"]
+    expected = [
+        np.nan if any(kind is each for each in NO_NUMBERS) else float(np.asarray(kind).item()) for kind in kinds
+    ]
+    assert found.dtype == np.float64
+    np.testing.assert_equal(found, expected)
+    line = "score, in the info that ends an episode, is no finite number there, and is left out\n"
+    assert capfd.readouterr().err.count(line) == 1
+
+
+def test_infos_that_gymnasium_cannot_batch():
+    """Arrays that grow, keys that come and go, an `episode` and a `final_info` of one's own."""
+
+    def tell(env):
+        info = {"seen": np.zeros(env.t), "episode": {"r": 99.0, "l": 99}, "final_info": 5, "score": env.number}
+        return info | {"once": "only here"} if env.t == env.number else info
+
+    envs = make_envs(small(count=itertools.count(), tell=tell), 3, seed=1)
+    envs.reset()
+    *_, infos = [*roll(envs, 3)][-1]
+    assert infos["episode"]["r"].tolist() == [3.0, 3.0, 3.0]
+    assert final_numbers(infos, np.ones(3, bool))["score"].tolist() == [0, 1, 2]
+
+
+@EACH_SCRIPT
+def test_over_how_many_episodes_a_mean_is(tiny, script, scalars):
+    """Lanes 0 and 1 say it, lanes 2 and 3 do not: 16 steps are 5 episodes of each."""
+    tell = lambda env: {"score": 0.5 * env.number} if env.number < 2 else {}  # noqa: E731
+    found = scalars(script.main(tiny(script, env_id=small(count=itertools.count(), tell=tell))))
+    assert found["episode/score"] == [0.25, 0.25]
+    assert found["episode/score_count"] == [10, 10]
+    assert not any(name.endswith("_count") for name in found if "score" not in name)
+
+
+def test_evaluations_say_which_metric_they_leave_out(tiny, capfd, scalars):
+    runs.tell_left_out.cache_clear()
+    tell = lambda env: {"success": 1.0} if env.ended and env.number % 2 else {}  # noqa: E731
+    args = tiny(env_id=small(count=itertools.count(), tell=tell), eval_interval=1, eval_levels=2)
+    found = scalars(ppo_gru.main(args))
+    assert "eval/return" in found
+    assert "eval/success" not in found
+    assert capfd.readouterr().err.count("evaluations leave out success: 3 of 6 episodes do not report it\n") == 1
+
+
+# ---- ground truth ----
+@pytest.mark.parametrize(("reports", "lane"), [
+    (lambda env: env.number % 2, 0), (lambda env: env.number != 2, 2), (lambda env: env.t == 0, 0)
+])  # fmt: skip
+def test_a_ground_truth_that_not_all_report(reports, lane, tiny):
+    tell = lambda env: {"ground_truth": np.ones(2)} if reports(env) else {}  # noqa: E731
+    message = f"every info, of every reset and step; environment {lane} reports none; use 0"
+    with pytest.raises(RunError, match=f"--ground-truth-coef needs ground_truth in {message}"):
+        ppo_gru.main(tiny(env_id=small(count=itertools.count(), tell=tell), ground_truth_coef=0.1))
+
+
+@pytest.mark.parametrize("truth", ["text", np.nan, [[1.0]], None, lambda env: np.ones(1 + env.t)])
+def test_a_ground_truth_that_is_none(tiny, truth):
+    tell = lambda env: {"ground_truth": truth(env) if callable(truth) else truth}  # noqa: E731
+    with pytest.raises(RunError, match="--ground-truth-coef needs ground_truth in every info"):
+        ppo_gru.main(tiny(env_id=small(tell=tell), ground_truth_coef=0.1))
+
+
+def test_the_ground_truth_is_each_lanes(tiny):
+    tell = lambda env: {"ground_truth": [env.number, env.t]}  # noqa: E731
+    envs = make_envs(small(count=itertools.count(), tell=tell), 3, seed=1)
+    args = tiny(ground_truth_coef=0.1)
+    assert ground_truth_of(envs.reset()[1], args).tolist() == [[0, 0], [1, 0], [2, 0]]
+    *_, infos = next(roll(envs, 1))
+    assert ground_truth_of(infos, args).tolist() == [[0, 1], [1, 1], [2, 1]]
+
+
+# ---- observations ----
+PICTURE = box(0, 255, (40, 48, 3), np.uint8)
+
+
+def test_parts_are_found_at_any_depth():
+    inside = gym.spaces.Dict({"eye": PICTURE, "hand": gym.spaces.Tuple((gym.spaces.Discrete(3, start=-1), NUMBER))})
+    space = gym.spaces.Tuple((inside, gym.spaces.Dict({"deeper": gym.spaces.Dict({"eye": PICTURE})})))
+    shown = []
+    envs = make_envs(small(space=space, see=lambda env: shown.append(space.sample()) or shown[-1]), 1, seed=0)
+    parts = {name: part.shape for name, part in envs.single_observation_space.items()}
+    assert parts == {"0.eye": (40, 48, 3), "0.hand.0": (3,), "0.hand.1": (1,), "1.deeper.eye": (40, 48, 3)}
+    observations, _ = envs.reset()
+    assert np.array_equal(observations["0.eye"][0], shown[-1][0]["eye"])
+    assert np.array_equal(observations["1.deeper.eye"][0], shown[-1][1]["deeper"]["eye"])
+    assert observations["0.hand.0"][0].tolist() == [float(shown[-1][0]["hand"][0] == each) for each in (-1, 0, 1)]
+    assert observations["0.hand.1"][0] == shown[-1][0]["hand"][1]
+    assert observations["0.eye"].dtype == np.uint8
+
+
+def test_two_parts_with_one_name():
+    space = gym.spaces.Dict({"a.b": NUMBER, "a": gym.spaces.Dict({"b": NUMBER})})
+    with pytest.raises(ValueError, match="two parts have the same name"):
+        make_envs(small(space=space), 1)
+
+
+@pytest.mark.parametrize(("shape", "joined"), [
+    ((4, 40, 48, 3), lambda shown: np.concatenate([*shown], -1)),
+    ((40, 48, 3, 2), lambda shown: shown.reshape(40, 48, 6)),
+    ((4, 3, 40, 48), lambda shown: shown.reshape(12, 40, 48).transpose(1, 2, 0)),
+])  # fmt: skip
+def test_a_stack_of_pictures_is_one_of_more_channels(shape, joined):
+    shown = []
+    space = box(0, 255, shape, np.uint8)
+    envs = make_envs(small(space=space, see=lambda env: shown.append(space.sample()) or shown[-1]), 1, seed=0)
+    assert np.array_equal(envs.reset()[0]["observation"][0], joined(shown[-1]))
+
+
+@pytest.mark.parametrize(("low", "high", "dtype"), [
+    (0, 1, np.uint8), (16, 235, np.uint8), (5, 5, np.uint8), (0, 9, np.int64), (-1, 1, np.float32), (0, 255, np.float32)
+])  # fmt: skip
+def test_pictures_are_scaled_by_their_bounds(low, high, dtype):
+    shown, space = [], box(low, high, (40, 48, 1), dtype)
+    envs = make_envs(small(space=space, see=lambda env: shown.append(space.sample()) or shown[-1]), 1, seed=0)
+    part, (observations, _) = envs.single_observation_space["observation"], envs.reset()
+    assert (part.low.min(), part.high.max(), part.dtype) == (0, 1, np.float32)
+    scaled = (shown[-1] - float(low)) / max(high - low, 1)
+    assert observations["observation"].dtype == np.float32
+    assert observations["observation"][0] == pytest.approx(scaled, abs=1e-7)
+
+
+def test_an_environment_that_returns_the_same_array_at_every_step():
+    """Its last observation is not the next episode's first one, nor is that of its parts."""
+    one = {"a": np.zeros(1, np.float32), "b": (np.zeros(1, np.float32),)}
+
+    def see(env):
+        one["a"][:] = one["b"][0][:] = env.t
+        return one
+
+    space = gym.spaces.Dict({"a": NUMBER, "b": gym.spaces.Tuple((NUMBER,))})
+    envs = make_envs(small(space=space, see=see, length=5), 1, seed=0, frame_stack=2)
+    envs.reset()
+    observations, *_, infos = [*roll(envs, 5)][-1]
+    assert {name: part[0].tolist() for name, part in observations.items()} == {"a": [0, 0], "b.0": [0, 0]}
+    assert {name: part.tolist() for name, part in infos["final_obs"][0].items()} == {"a": [4, 5], "b.0": [4, 5]}
+
+
+WRONG = [
+    (gym.spaces.MultiDiscrete([4, 4]), np.array([1, 4]), "observation is 4, outside of 0 to 3"),
+    (gym.spaces.Discrete(5), -1, "observation is -1, outside of 0 to 4"),
+    (gym.spaces.Discrete(5, start=2), 7, "observation is 7, outside of 2 to 6"),
+    (NUMBER, np.array([np.nan], np.float32), "observation has an entry nan"),
+    (box(-1, 1, (40, 40, 3)), np.full((40, 40, 3), np.inf, np.float32), "observation has an entry inf"),
+    (gym.spaces.Dict({"a": gym.spaces.Tuple((gym.spaces.Discrete(2),))}), {"a": (2,)}, r"a\.0 is 2, outside of 0 to 1"),
+]
+
+
+@pytest.mark.parametrize(("space", "wrong", "message"), WRONG, ids=[case[2] for case in WRONG])
+@pytest.mark.parametrize("last", [False, True], ids=["in an episode", "at its end"])
+def test_a_wrong_observation_is_one_line(space, wrong, message, last):
+    def see(env):
+        return wrong if env.number == 1 and env.episode == 2 and env.t == (3 if last else 2) else right
+
+    right = space.sample() if space is not NUMBER else np.zeros(1, np.float32)
+    env_id = small(count=itertools.count(), space=space, see=see)
+    envs = make_envs(env_id, 2, seed=3, first_lane=4)
+    seed, steps = lanes(envs)[1].seeds[0], 3 * 1 + (3 if last else 2)
+    envs.reset()
+    where = rf"environment 5, step {steps} since its reset with seed {seed}"
+    with pytest.raises(RunError, match=rf"^{env_id}: {message} \({where}\)$"):
+        [*roll(envs, 10)]
+
+
+@EACH_SCRIPT
+@pytest.mark.parametrize("what", ["observation", "reward"])
+def test_a_training_stops_before_what_is_not_finite(tiny, script, what):
+    """The line names the last good checkpoint; the learning rate has nothing to do with it."""
+    bad = lambda env: env.number == 2 and env.episode == 8 and env.t == 1  # noqa: E731
+    see = lambda env: np.array([np.nan if bad(env) and what == "observation" else 0.0], np.float32)  # noqa: E731
+    earn = lambda env: np.inf if bad(env) and what == "reward" else 1.0  # noqa: E731
+    args = tiny(script, env_id=small(count=itertools.count(), see=see, earn=earn), checkpoint_interval=1)
+    with pytest.raises(RunError) as error:
+        script.main(args)
+    says = "observation has an entry nan" if what == "observation" else "the reward is inf"
+    assert f"iteration 2: {args.env_id}: {says} (environment 2, step 22 since its reset with seed " in str(error.value)
+    assert "the last checkpoint is runs/" in str(error.value)
+    assert "checkpoint-64.pt" in str(error.value)
+    assert "init-lr" not in str(error.value)
+
+
+class Together(gym.vector.VectorEnv):
+    """A vector environment that resets in the same step; its final_obs is one array for all lanes, or objects."""
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(self, num_envs, as_objects, nested, render_mode=None):
+        self.num_envs, self.as_objects, self.nested = num_envs, as_objects, nested
+        self.single_action_space = gym.spaces.Discrete(2)
+        self.action_space = gym.spaces.MultiDiscrete([2] * num_envs)
+        self.single_observation_space = gym.spaces.Dict({"a": NUMBER, "b": NUMBER}) if nested else NUMBER
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
+
+    def _observations(self, values):
+        values = values.astype(np.float32)[:, None]
+        return {"a": values, "b": -values} if self.nested else values
+
+    def reset(self, *, seed=None, options=None):
+        self.t = np.zeros(self.num_envs)
+        return self._observations(self.t), {}
+
+    def step(self, actions):
+        self.t += 1
+        ended, last = self.t == 2 + np.arange(self.num_envs), self._observations(self.t)
+        self.t[ended] = 0
+        infos = {}
+        if ended.any():
+            final = last
+            if self.as_objects:
+                final = np.full(self.num_envs, None)
+                for lane in np.flatnonzero(ended):
+                    final[lane] = {k: v[lane] for k, v in last.items()} if self.nested else last[lane]
+            infos = {"final_obs": final, "_final_obs": ended, "final_info": {"score": 3 * self.t + 1}}
+        return self._observations(self.t), np.ones(self.num_envs), ended, np.zeros(self.num_envs, bool), infos
+
+
+@pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.parametrize("as_objects", [False, True])
+def test_vector_environments_of_others(as_objects, nested):
+    env_id = f"Together{as_objects}{nested}-v0"
+    gym.register(env_id, vector_entry_point=Together, kwargs={"as_objects": as_objects, "nested": nested})
+    envs = make_envs(env_id, 3, seed=0, frame_stack=2)
+    envs.reset()
+    for t, (observations, *_, infos) in enumerate(roll(envs, 4), 1):
+        name = "b" if nested else "observation"
+        sign = -1 if nested else 1
+        if 2 <= t <= 4:
+            lane = t - 2
+            assert infos["final_obs"][lane][name].tolist() == [sign * (t - 1), sign * t]
+            if t < 4:
+                assert observations[name][lane].tolist() == [0, 0]
+            assert final_numbers(infos, np.arange(3) == lane)["score"][lane] == 1
+
+
+@pytest.mark.parametrize("seed", range(1, 31))
+def test_seeds_fit_in_31_bits(seed):
+    assert all(0 <= lane.seeds[0] < 2**31 for lane in lanes(make_envs(small(), 3, seed=seed, first_lane=1000)))
+
+
+# ---- levels ----
+def test_levels_of_other_packages_are_seeds(tiny):
+    """Resets take seeds of the set, all of them and each as often; evaluation takes those after it."""
+    envs = make_envs(small(length=1), 4, seed=1, num_levels=5, start_level=20)
+    envs.reset()
+    list(roll(envs, 100))
+    seeds = [seed for lane in lanes(envs) for seed in lane.seeds[1:]]
+    assert set(seeds) == {20, 21, 22, 23, 24}
+    assert np.bincount(seeds)[20:].min() > 50
+    assert len({tuple(lane.seeds[1:]) for lane in lanes(envs)}) == 4, "each lane draws its own"
+    again = make_envs(small(length=1), 4, seed=1, num_levels=5, start_level=20)
+    again.reset()
+    list(roll(again, 100))
+    assert [lane.seeds for lane in lanes(again)] == [lane.seeds for lane in lanes(envs)]
+    args = tiny(num_levels=5, start_level=20)
+    assert evaluation.evaluation_levels(args, 2, 1) == [25, 26]
+
+
+def test_without_levels_resets_have_no_seed():
+    envs = make_envs(small(length=1), 2, seed=1)
+    envs.reset()
+    list(roll(envs, 3))
+    assert all(lane.seeds[1:] == [None] * 4 for lane in lanes(envs))
+
+
+# ---- constructor arguments ----
+class Sized(Small):
+    def __init__(self, size, color="red", render_mode=None):
+        super().__init__(space=box(0, 1, (size,)), see=lambda env: np.zeros(size, np.float32))
+
+
+def test_constructor_arguments(tiny):
+    args = parse_args(ppo_gru, "--env-id", register(Sized), "--env-kwargs", '{"size": 9}')
+    assert envs_for(args, 2).single_observation_space["observation"].shape == (9,)
+    assert make_envs("FrozenLake-v1", 1, env_kwargs={"map_name": "8x8"}).single_observation_space[
+        "observation"
+    ].shape == (64,)
+
+
+@pytest.mark.parametrize(("env_id", "text", "message"), [
+    (register(Sized), '{"sise": 9}', "has no argument 'sise'; it has size, color"),
+    ("CartPole-v1", '{"size": 9}', "CartPole-v1 has no argument 'size'; it has sutton_barto_reward"),
+    ("CartPole-v1", "[9]", '--env-kwargs must be a JSON object such as {"size": 9}, not [9]'),
+    ("CartPole-v1", "{size", "--env-kwargs is no JSON"),
+    ("MysteryPath-v0", '{"size": 9}', "MysteryPath-v0 has options"),
+])  # fmt: skip
+def test_wrong_constructor_arguments(tiny, env_id, text, message):
+    with pytest.raises(ValueError, match=r"(?s).*") as error:
+        envs_for(tiny(env_id=env_id, env_kwargs=text), 1)
+    assert message in str(error.value)
+
+
+# ---- processes of their own ----
+@EACH_SCRIPT
+def test_environments_in_processes_of_their_own(tiny, script, curves):
+    args = tiny(script, env_id="CartPole-v1", observe_last_action=True)
+    assert curves(script.main(args)) == curves(script.main(tiny(script, **{**vars(args), "async_envs": True})))
+
+
+def test_an_error_in_another_process():
+    def see(env):
+        if env.t == 2:
+            raise ValueError("no such room")
+        return np.zeros(1, np.float32)
+
+    envs = make_envs(small(see=see), 2, seed=1, asynchronous=True)
+    envs.reset()
+    with pytest.raises(RuntimeError, match=r"environment \d raised ValueError in step 2 .*: no such room"):
+        list(roll(envs, 3))
+    envs.close()
+
+
+# ---- videos ----
+def marked(number, bits=8, side=16):
+    """A picture whose columns are the bits of a number."""
+    columns = [255 * (number >> bit & 1) for bit in range(bits)]
+    return np.repeat(np.repeat(np.array(columns, np.uint8)[None], side, 0), side, 1)
+
+
+def marks_in(path):
+    """The numbers of the frames of a video, in order."""
+    reader = imageio_ffmpeg.read_frames(
+        str(path), pix_fmt="gray", bits_per_pixel=8, output_params=["-fps_mode", "passthrough"]
+    )
+    width, height = next(reader)["size"]
+    frames = [np.frombuffer(frame, np.uint8).reshape(height, width) for frame in reader]
+    return [sum(int(frame[8, 8 + 16 * bit] > 127) << bit for bit in range(8)) for frame in frames]
+
+
+@pytest.mark.parametrize("first", range(1, 131, 26))
+def test_every_step_is_in_the_video_once_and_in_order(first, tmp_path):
+    """130 lengths, and each frame rate from 1 to 60 at least twice."""
+    for length in range(first, first + 26):
+        fps = 1 + 7 * length % 60
+        path, writer = tmp_path / "some.mp4", None
+        writer = video_writer(path, (16, 128, 3), fps)
+        for number in range(length):
+            writer.send(even(as_picture(marked(number))))
+        writer.close()
+        assert marks_in(path) == [*range(length)], (length, fps)
+
+
+@pytest.mark.parametrize("fps", [3, 6, 30])
+def test_a_video_holds_every_observation_that_was_acted_on(fps, tmp_path, monkeypatch):
+    monkeypatch.setitem(Small.metadata, "render_fps", fps)
+    length = lambda env: 128 if env.episode else 46  # noqa: E731
+    envs = make_envs(small(length=length, draw=lambda env: marked(env.t)), 2, render_mode="rgb_array")
+    envs.reset(seed=0)
+    envs = LaneVideo(envs, str(tmp_path))
+    list(roll(envs, 46 + 128))
+    envs.close()
+    assert marks_in(tmp_path / "episode-0.mp4") == [*range(46)]
+    assert marks_in(tmp_path / "episode-1.mp4") == [*range(128)]
+
+
+GRAY = np.arange(48, dtype=np.uint8).reshape(6, 8)
+FRAMES = {
+    "gray": GRAY,
+    "gray with a channel": GRAY[..., None],
+    "color": np.repeat(GRAY[..., None], 3, 2),
+    "with alpha": np.concatenate([np.repeat(GRAY[..., None], 3, 2), np.full((6, 8, 1), 9, np.uint8)], 2),
+    "floats": GRAY / 255,
+    "integers": GRAY.astype(np.int64),
+    "a list": GRAY.tolist(),
+}
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_every_picture_is_one_of_bytes(name):
+    picture = as_picture(FRAMES[name])
+    assert (picture.dtype, picture.shape) == (np.uint8, (6, 8, 3))
+    assert np.array_equal(picture[..., 1], GRAY)
+
+
+@pytest.mark.parametrize("frame", [None, [], "text", np.zeros((3, 4, 5)), np.zeros((0, 4)), np.zeros(4), [None]])
+def test_what_is_no_picture(frame):
+    with pytest.raises(ValueError, match=r"render\(\) returned no picture"):
+        as_picture(frame)
+
+
+DRAWS = {
+    "nothing": lambda env: None,
+    "a picture in a list": lambda env: [np.zeros((4, 4, 3), np.uint8)],
+    "other sizes": lambda env: np.zeros((16 + 2 * env.t, 16, 3), np.uint8),
+    "an error": lambda env: 1 / 0,
+}
+
+
+@pytest.mark.parametrize("name", DRAWS)
+def test_a_video_that_cannot_be_written_costs_itself(name, tiny, capfd):
+    folder = ppo_gru.main(tiny(env_id=small(draw=DRAWS[name]), capture_video=True))
+    assert (folder / "checkpoint-128.pt").exists()
+    frames = 1 if name == "other sizes" else 0
+    assert f"the video of episode 0 ends after {frames} frames: " in capfd.readouterr().err
+
+
+# ---- lines ----
+def test_a_large_observation_is_named_where_memory_is_short(tiny):
+    large, small = gym.spaces.Dict({"a": box(0, 1, (10**7,))}), gym.spaces.Dict({"a": NUMBER})
+    for space, named in ((large, "the observation, 40 MB each time; or of --num-envs 64"), (small, "--num-envs 64")):
+        with (
+            pytest.raises(ValueError, match=f"does not fit in the memory of cpu; use less of {named}$"),
+            runs.report_out_of_memory(tiny(num_envs=64), torch.device("cpu"), space),
+        ):
+            raise MemoryError
+
+
+def test_a_module_in_the_current_folder(tmp_path, monkeypatch):
+    """Wherever the script lies: Python looks in its folder alone."""
+    text = "import gymnasium\ngymnasium.register('Here-v0', entry_point='gymnasium.envs.classic_control:CartPoleEnv')"
+    (tmp_path / "here_envs.py").write_text(text)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", os.getcwd())])
+    assert find_spec("here_envs:Here-v0").id == "Here-v0"
+
+
+@EACH_SCRIPT
+def test_a_loop_past_its_room(script, tiny, opened):
+    run = opened(script, tiny(script, env_id="CartPole-v1"))
+    memory, obs = run.agent.memory.initial_state(4, 2, torch.device("cpu")), run.rollout.next_obs
+    act = lambda: run.agent.get_action_and_value(environments.as_tensors(obs, torch.device("cpu")), memory)  # noqa: E731
+    act(), act()
+    with pytest.raises(IndexError, match=r"no room for this step; begin_rollout\(state, carry\(state\)\) makes room"):
+        act()
+    run.agent.memory.begin_rollout(memory, run.agent.memory.carry(memory))
+    act()
+
+
+@pytest.mark.parametrize(
+    ("text", "steps"), [("1e6", 10**6), ("1_000_000", 10**6), ("2.5e5", 250_000), ("3e7", 3 * 10**7)]
+)
+def test_step_counts(text, steps):
+    assert parse_args(ppo_gru, "--total-timesteps", text, "--anneal-steps", text).total_timesteps == steps
+    assert parse_args(ppo_gru, "--total-timesteps", text, "--anneal-steps", text).anneal_steps == steps
+
+
+@pytest.mark.parametrize("text", ["1.5", "1e-3", "nan", "inf", "1e6x"])
+def test_what_is_no_step_count(text, capfd):
+    with pytest.raises(SystemExit):
+        parse_args(ppo_gru, "--total-timesteps", text)
+    assert "total-timesteps" in capfd.readouterr().err
+
+
+def test_actions_are_the_environments_own():
+    assert env_actions(gym.spaces.Discrete(3, start=5), np.array([[2], [0]])).tolist() == [7, 5]
+    branches = gym.spaces.MultiDiscrete([2, 3], start=[1, 0])
+    assert env_actions(branches, np.array([[1, 2]])).tolist() == [[2, 2]]
