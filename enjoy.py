@@ -1,12 +1,13 @@
-"""Play one episode of a trained agent and write a page to watch it think.
+"""Play episodes of trained agents and write a page to watch them.
 
     python enjoy.py runs/RUN/model.pt --out page.html
+    python enjoy.py agents/mortar-mayhem-grid-trxl.pt agents/mortar-mayhem-grid-gru.pt --levels 3
 
-The page is one file that needs no network: what the agent saw beside the ground truth (and beside what it painted from
-memory, where it was trained to), the probabilities of its actions, its state values and its policy's entropy, the
-rewards, and what every block of a Transformer-XL looked at (thesis 6.5). Needs the extra `eval`.
+The page is one file that needs no network: what the agent saw beside the ground truth (and beside what it reconstructed
+from memory, where it was trained to), its actions and their probabilities, its state values and its policy's entropy,
+the rewards, and the steps that every block of a Transformer-XL attended to (thesis 6.5). Needs the extra `eval`.
 
-Shape letters: T steps of the episode, A action branches, K blocks, H heads, M items that the last step could look at.
+Shape letters: T steps of the episode, A action branches, K blocks, H heads, M earlier steps that a step attends to.
 """
 
 import base64
@@ -14,6 +15,7 @@ import io
 import json
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,8 +27,10 @@ import tyro
 from torch import Tensor, nn
 
 from ppo_utils.checkpoints import import_script, load_weights, make_agent, read_model, saved_args
-from ppo_utils.environments import as_tensors, envs_for, final_numbers, is_memory_gym
-from ppo_utils.video import check_draws
+from ppo_utils.environments import as_tensors, envs_for, final_numbers, is_memory_gym, with_options, wrappers_of
+from ppo_utils.evaluation import first_unseen
+from ppo_utils.processes import RunError
+from ppo_utils.video import as_picture, check_draws
 
 try:
     from PIL import Image
@@ -43,13 +47,57 @@ ENDLESS_PATH = {"action": ["none", "right", "up", "down"]}
 
 
 @dataclass
+class Family:
+    """What the page says of the environments of a Memory Gym family."""
+
+    truth: str  # what the ground truth is, and the names of its numbers, of which an endless id has fewer
+    numbers: list[str]
+    rewarded: str  # the event that earns a positive reward
+    shown: str  # an event that the frame shows, and whether it does in a state of one lane
+    shows: Callable[[Any], bool]
+
+
+FAMILIES = {
+    "MortarMayhem": Family(
+        truth="the target tile, from 0 to 1 across the arena",
+        numbers=["column", "row"],
+        rewarded="command completed",
+        shown="command shown",
+        shows=lambda state: state.symbol[0] > 0,
+    ),
+    "MysteryPath": Family(
+        truth="the direction of the path's next tile",
+        numbers=["right", "up", "down", "left"],
+        rewarded="rewarded tile",
+        shown="fell off",
+        shows=lambda state: state.fallen[0],
+    ),
+    "SearingSpotlights": Family(
+        truth="positions, from 0 to 1 across the frame",
+        numbers=["agent x", "agent y", "coin x", "coin y", "exit x", "exit y"],
+        rewarded="coin or exit",
+        shown="in a spotlight",
+        shows=lambda state: state.floor[0] > 0,
+    ),
+}
+
+
+@dataclass
 class Config:
-    """Play one episode of a trained agent and write a page to watch it think."""
+    """Play episodes of trained agents and write a page to watch them."""
 
     checkpoint: Annotated[str, tyro.conf.Positional]
     """a file that --save-model wrote"""
+    others: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """further ones, of agents that play the same task, to compare on the same levels"""
     seed: int | None = None
     """the level, and the seed of the actions (default: the first level after those of the training)"""
+    levels: int = 1
+    """levels to play, from this one on"""
+    deterministic: bool = False
+    """take the most probable actions instead of drawing them"""
+    env_options: str | None = None
+    """reset options of a Memory Gym environment as JSON, over those of the training"""
     out: str = "page.html"
     """the page to write"""
     max_steps: int = 1000
@@ -94,7 +142,8 @@ class Episode:
     rewards: list[float] = field(default_factory=list)  # T
     truth: list[np.ndarray] = field(default_factory=list)  # T x (G,); empty where the environment tells none
     estimate: list[np.ndarray] = field(default_factory=list)  # T x (G,); empty without an estimator
-    attention: list[np.ndarray] = field(default_factory=list)  # T x (K, H, M or fewer), the oldest item first
+    attention: list[np.ndarray] = field(default_factory=list)  # T x (K, H, M or fewer), the oldest step first
+    events: dict[str, list[int]] = field(default_factory=dict)  # the steps of each, by its name
     finished: bool = False  # not cut short
     stacked: bool = False  # its images are stacks of grayscale ones
     final: dict[str, float] = field(default_factory=dict)  # numbers of the final info
@@ -106,14 +155,24 @@ class Episode:
 
 # ---- PLAY ----
 @torch.no_grad()
-def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, max_steps: int, stacked: bool = False) -> Episode:
-    """Play one episode, or max_steps of it, in the only lane of `envs`: fresh memory, stochastic policy.
+def play(
+    agent: nn.Module,
+    envs: gym.vector.VectorEnv,
+    seed: int,
+    max_steps: int,
+    deterministic: bool = False,
+    stacked: bool = False,
+) -> Episode:
+    """Play one episode, or max_steps of it, in the only lane of `envs`, with an empty memory.
 
-    stacked: whether the images that the agent gets are stacks of grayscale ones.
-
+    deterministic: take the most probable actions. stacked: whether the images that the agent gets are stacks of
+    grayscale ones. Raises ValueError if there are no pictures, and RunError as the environment does.
     """
     torch.manual_seed(seed)
+    family = family_of(envs.spec.id)
     episode = Episode(stacked=stacked)
+    if family:
+        episode.events = {family.shown: [], family.rewarded: [], "failure": []}
     obs, infos = envs.reset(seed=seed)
     memory = agent.memory.initial_state(1, max_steps, torch.device("cpu"))
     while not episode.finished and len(episode.actions) < max_steps:
@@ -121,17 +180,22 @@ def play(agent: nn.Module, envs: gym.vector.VectorEnv, seed: int, max_steps: int
             episode.film(name, frame)
         if "ground_truth" in infos:
             episode.truth.append(infos["ground_truth"][0])
-        actions = act(agent, as_tensors(obs, torch.device("cpu")), memory, episode)
+        step = len(episode.actions)
+        if family and family.shows(envs.unwrapped.state):
+            episode.events[family.shown].append(step)
+        actions = act(agent, as_tensors(obs, torch.device("cpu")), memory, episode, deterministic)
         obs, rewards, terminated, truncated, infos = envs.step(actions.numpy())
         episode.rewards.append(float(rewards[0]))
+        if family and (rewards[0] > 0 or terminated[0]):
+            episode.events[family.rewarded if rewards[0] > 0 else "failure"].append(step)
         episode.finished = bool(terminated[0] or truncated[0])
     if episode.finished:
         episode.final = {name: values.item() for name, values in final_numbers(infos, np.ones(1, bool)).items()}
     return episode
 
 
-def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode) -> Tensor:
-    """Return actions (1, A), as `Agent.get_action_and_value` does; add what was computed to the episode."""
+def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode, deterministic: bool) -> Tensor:
+    """Return actions (1, A), as `get_action_and_value` or `most_probable`; add what was computed to the episode."""
     x = agent.encoder(obs)
     y, stored = agent.memory.step(memory, x)
     if hasattr(agent.memory, "attended_rows"):  # a transformer
@@ -139,7 +203,7 @@ def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode)
     agent.memory.advance(memory, stored)
     logits, values, features = agent.heads(y)
     policy = agent.heads.distributions(logits)
-    actions = torch.stack([branch.sample() for branch in policy], -1)
+    actions = torch.stack([branch.logits.argmax(-1) if deterministic else branch.sample() for branch in policy], -1)
     episode.policy.append([branch.probs[0].numpy() for branch in policy])
     episode.actions.append(actions[0].tolist())
     episode.values.append(values.item())
@@ -189,10 +253,10 @@ def views(envs: gym.vector.VectorEnv, obs: dict[str, np.ndarray], stacked: bool)
 def rendered(envs: gym.vector.VectorEnv, mode: str) -> np.ndarray:
     """Return the lane's picture in this render mode, reduced to LARGEST pixels; raise ValueError if there is none."""
     envs.unwrapped.render_mode = mode  # a Memory Gym environment draws in both, whichever it was made with
-    frame = (envs.render() or [None])[0]
-    if not isinstance(frame, np.ndarray):
+    frames = envs.render()
+    if frames is None or frames[0] is None:
         raise ValueError(f"{envs.spec.id} draws no pictures (render_mode {mode}); there would be nothing to watch")
-    image = Image.fromarray(frame)
+    image = Image.fromarray(as_picture(frames[0]))
     image.thumbnail((LARGEST, LARGEST))
     return np.asarray(image)
 
@@ -211,12 +275,12 @@ def displayable(pixels: np.ndarray, stacked: bool) -> np.ndarray:
 
 
 # ---- PAGE ----
-def page_data(episode: Episode, env_id: str, facts: dict[str, Any]) -> dict[str, Any]:
-    """Return all that the page shows, as JSON can hold it; facts, by name, stand in its head."""
+def episode_data(episode: Episode, env_id: str, facts: dict[str, Any]) -> dict[str, Any]:
+    """Return an episode as JSON can hold it; facts, by name, stand in the page's head."""
     lines = {"state value": episode.values, "entropy": episode.entropies, "reward": episode.rewards}
     branches = zip(branch_names(env_id, episode.policy[0]).items(), zip(*episode.policy, strict=True), strict=True)
+    family = family_of(env_id)
     return {
-        "title": env_id,
         "facts": facts,
         "steps": len(episode.actions),
         "videos": [video_data(name, video) for name, video in episode.videos.items()],
@@ -226,10 +290,18 @@ def page_data(episode: Episode, env_id: str, facts: dict[str, Any]) -> dict[str,
         ],
         "actions": episode.actions,
         "lines": {name: rounded(line) for name, line in lines.items()},
+        "events": episode.events,
+        "truth_is": family.truth if family else "",
+        "truth_names": family.numbers[: len(episode.truth[0])] if family else [],
         "truth": rounded(episode.truth),
         "estimate": rounded(episode.estimate),
         "attention": packed(episode.attention),
     }
+
+
+def family_of(env_id: str) -> Family | None:
+    """Return the family of a Memory Gym environment; None for all others."""
+    return next((family for name, family in FAMILIES.items() if name in env_id and is_memory_gym(env_id)), None)
 
 
 def video_data(name: str, video: Video) -> dict[str, Any]:
@@ -244,7 +316,8 @@ def branch_names(env_id: str, branches: list[np.ndarray]) -> dict[str, list[str]
     sizes = [len(branch) for branch in branches]
     if is_memory_gym(env_id):
         return FREE if sizes == [3, 3] else ENDLESS_PATH if "Endless" in env_id else GRID
-    return {f"branch {i + 1}": [str(action) for action in range(size)] for i, size in enumerate(sizes)}
+    names = ["action"] if len(sizes) == 1 else [f"branch {i + 1}" for i in range(len(sizes))]
+    return {name: [str(action) for action in range(size)] for name, size in zip(names, sizes, strict=True)}
 
 
 def rounded(numbers: list) -> list:
@@ -253,19 +326,18 @@ def rounded(numbers: list) -> list:
 
 
 def packed(attention: list[np.ndarray]) -> dict[str, Any] | None:
-    """Pack scores, summed over the heads, as T x K x M 16-bit numbers of which 65,535 is the sum of all heads.
+    """Pack attention weights as T x K x H x M bytes, 255 times their square roots: small weights keep their digits.
 
-    Column M - a is the step that was a steps ago; one that was not there has score 0.
+    Entry M - a is the weight of the step that was a steps ago; one that was not there has 0.
     """
     if not attention:
         return None
     blocks, heads, _ = attention[0].shape
-    items = max(each.shape[2] for each in attention)
-    scores = np.zeros((len(attention), blocks, items))
+    window = max(each.shape[2] for each in attention)
+    weights = np.zeros((len(attention), blocks, heads, window), np.uint8)
     for step, each in enumerate(attention):
-        scores[step, :, items - each.shape[2] :] = each.mean(1)
-    integers = (scores * 65535).round().astype("<u2")
-    return {"blocks": blocks, "heads": heads, "items": items, "scores": base64.b64encode(integers.tobytes()).decode()}
+        weights[step, :, :, window - each.shape[2] :] = (np.sqrt(each) * 255).round()
+    return {"blocks": blocks, "heads": heads, "window": window, "weights": base64.b64encode(weights.tobytes()).decode()}
 
 
 def page(data: dict[str, Any], plotly: str) -> str:
@@ -276,15 +348,17 @@ def page(data: dict[str, Any], plotly: str) -> str:
 
 
 # ---- MAIN ----
-def load(path: str) -> tuple[nn.Module, gym.vector.VectorEnv, Any]:
+def load(path: str, env_options: str | None = None) -> tuple[nn.Module, gym.vector.VectorEnv, Any]:
     """Return the agent in the file, one lane of its environment that draws pictures, and its training's arguments.
 
-    Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
+    env_options: JSON, over those of the training. Raises ValueError, OSError, ImportError, gymnasium.error.Error or
+    RunError, each with one line for the user.
     """
     saved = read_model(path)
     script = import_script(saved, path)
     args = replace(saved_args(script.Args, saved), amp=False)  # one lane is little work; not all CPUs have bfloat16
     check_draws("enjoy.py", args.env_id)
+    args = with_options(args, env_options)
     envs = envs_for(args, 1, render_mode="debug_rgb_array")
     _, infos = envs.reset()
     agent = make_agent(script.Agent, envs, infos, args)
@@ -294,48 +368,80 @@ def load(path: str) -> tuple[nn.Module, gym.vector.VectorEnv, Any]:
 
 def main(config: Config) -> str:
     """Play, write the page, and return one line that says how it went. Raises what `load` and `play` raise."""
-    if not 1 <= config.max_steps <= 100_000:
-        raise ValueError(f"--max-steps is {config.max_steps}; it must be from 1 to 100000")
-    if config.seed is not None and not 0 <= config.seed < 2**63:
-        raise ValueError(f"--seed is {config.seed}; it must be from 0 to 2 ** 63 - 1")
+    check(config)
+    players = {path: load(path, config.env_options) for path in dict.fromkeys((config.checkpoint, *config.others))}
+    tasks = {path: (args.env_id, options_of(args)) for path, (_, _, args) in players.items()}
+    env_id, options = tasks[config.checkpoint]
+    for path, task in tasks.items():
+        if task != (env_id, options):
+            raise ValueError(f"{path} plays another task than {config.checkpoint}; agents on one page play the same")
+    seed = max(first_unseen(args) for _, _, args in players.values()) if config.seed is None else config.seed
+    episodes = []
+    for level in range(seed, seed + config.levels):
+        for path, (agent, envs, args) in players.items():
+            episode = play(agent, envs, level, config.max_steps, config.deterministic, stacked=args.frame_stack > 0)
+            facts = {"agent": "/".join(Path(path).absolute().parts[-2:]), "memory": memory_of(args)}
+            facts |= {"actions": "most probable" if config.deterministic else "sampled", "seed": level}
+            episodes.append(episode_data(episode, env_id, facts | outcome(episode, env_id)))
+    data = {"title": env_id, "options": options, "episodes": episodes}
     out = Path(config.out)
-    if not out.parent.is_dir():
-        raise OSError(f"--out is {out}, but there is no folder {out.parent}")
-    agent, envs, args = load(config.checkpoint)
-    seed = args.start_level + args.num_levels if config.seed is None else config.seed
-    episode = play(agent, envs, seed, config.max_steps, stacked=args.frame_stack > 0)
-    facts = summary(episode, args, seed)
-    out.write_text(page(page_data(episode, args.env_id, facts), get_plotlyjs()), encoding="utf-8")
-    size = out.stat().st_size / 1e6
-    return f"{out}: {facts['steps']} steps, return {facts['return']}, {size:.1f} MB"
+    out.write_text(page(data, get_plotlyjs()), encoding="utf-8")
+    played = "; ".join("{steps} steps, return {return}".format(**episode["facts"]) for episode in episodes)
+    return f"{out}: {played}, {out.stat().st_size / 1e6:.1f} MB"
 
 
-def kind(args: Any) -> str:
-    """Name the agent's memory."""
+def check(config: Config) -> None:
+    """Raise ValueError or OSError for a flag that is out of range, or a page that has no folder."""
+    for name, value, most in (("max-steps", config.max_steps, 100_000), ("levels", config.levels, 100)):
+        if not 1 <= value <= most:
+            raise ValueError(f"--{name} is {value}; it must be from 1 to {most}")
+    if config.seed is not None and not 0 <= config.seed <= 2**63 - config.levels:
+        raise ValueError(f"--seed is {config.seed}; levels must be from 0 to 2 ** 63 - 1")
+    folder = Path(config.out).parent
+    if not folder.is_dir():
+        raise OSError(f"--out is {config.out}, but there is no folder {folder}")
+
+
+def options_of(args: Any) -> dict[str, Any]:
+    """Return the environment's options that are not its defaults."""
+    return json.loads(args.env_options) | json.loads(args.env_kwargs)
+
+
+def memory_of(args: Any) -> str:
+    """Name the agent's memory, its size, and what else it computes with or observes."""
     if hasattr(args, "memory"):
-        return {"gru": "GRU", "lstm": "LSTM", "none": "no memory"}[args.memory]
-    if hasattr(args, "trxl_gate"):
-        return "GTrXL" if args.trxl_gate == "gru" else "TrXL"
-    return args.exp_name
+        parts = [{"gru": "GRU", "lstm": "LSTM", "none": "no memory"}[args.memory]]
+        parts += [f"{args.num_layers} x {args.hidden_size} units"] * (args.memory != "none")
+    elif hasattr(args, "trxl_gate"):
+        parts = ["GTrXL" if args.trxl_gate == "gru" else "TrXL", f"{args.trxl_num_layers} blocks"]
+        parts += [f"{args.trxl_num_heads} heads", f"width {args.trxl_dim}", f"window {args.trxl_memory_length}"]
+        encoding = args.trxl_positional_encoding.replace("none", "no")
+        parts += [f"{encoding} positional encoding", f"{args.trxl_layer_norm}-norm"]
+    else:
+        parts = [args.exp_name]
+    flags = {name: getattr(args, name, False) for name in ("trxl_query_position", "trxl_query_output")}
+    for name, value in (flags | wrappers_of(args)).items():
+        if value:
+            parts.append(name.removeprefix("trxl_").replace("_", " ") + (f" {value}" if value is not True else ""))
+    return ", ".join(parts)
 
 
-def summary(episode: Episode, args: Any, seed: int) -> dict[str, Any]:
-    """Return what the page's head tells of the episode."""
+def outcome(episode: Episode, env_id: str) -> dict[str, Any]:
+    """Return what the page's head tells of the episode's end."""
     steps = len(episode.actions)
-    facts = {"agent": kind(args), "seed": seed}
-    facts |= {"steps": steps, "return": f"{sum(episode.rewards):.4g}"}
-    facts |= {
-        name.replace("_", " "): f"{value:.4g}"
-        for name, value in episode.final.items()
-        if name not in ("reward", "length")
-    }
+    facts = {"steps": steps, "return": f"{sum(episode.rewards):.4g}"}
+    shares = {"agent_health"} | ({"commands_completed", "coins_collected"} if "Endless" not in env_id else set())
+    for name, value in episode.final.items():
+        if name not in ("reward", "length"):
+            is_share = name in shares and is_memory_gym(env_id)
+            facts[name.replace("_", " ")] = f"{value:.0%}".replace("%", " %") if is_share else f"{value:.4g}"
     return facts if episode.finished else facts | {"cut short": f"after {steps} steps"}
 
 
 if __name__ == "__main__":
     try:
         print(main(tyro.cli(Config)))
-    except (ValueError, OSError, ImportError, gym.error.Error) as error:
+    except (ValueError, OSError, ImportError, gym.error.Error, RunError) as error:
         sys.exit(f"enjoy.py: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
         sys.exit(130)

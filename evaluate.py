@@ -645,7 +645,7 @@ def play(checkpoint: Checkpoint, config: Config) -> dict[str, np.ndarray]:
     args = checkpoint.args
     device = torch.device("cuda" if torch.cuda.is_available() and config.cuda else "cpu")
     levels = evaluation_levels(args, config.levels, config.repeats, config.start_level)
-    envs = envs_for(args, len(levels))
+    envs = envs_for(args, len(levels), asynchronous=False)  # a process for each episode would be many
     _, infos = envs.reset()
     agent = make_agent(checkpoint.script.Agent, envs, infos, args).to(device)
     load_weights(agent, checkpoint.saved, checkpoint.path)

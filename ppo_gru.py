@@ -86,7 +86,7 @@ class Args:
     env_kwargs: str = "{}"
     """constructor arguments of another package's environment as JSON, e.g. '{"size": 9}'"""
     async_envs: bool = False
-    """run each environment in a process of its own, for slow ones of other packages"""
+    """train in environments that are each a process of their own, for slow ones of other packages"""
     num_levels: NonNegativeInt = 100_000
     """number of levels to train on (0: no limit); in environments of other packages, a level is a seed"""
     start_level: NonNegativeInt = 0

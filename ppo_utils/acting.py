@@ -8,10 +8,10 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array
 
-from memory_gym_envs.options import brief
 from ppo_utils.checkpoints import import_script, load_weights, make_agent, read_model, saved_args
 from ppo_utils.environments import as_tensors, env_actions, envs_for, wrap_envs, wrappers_of
 from ppo_utils.evaluation import MEMORY_STEPS, most_probable
+from ppo_utils.lanes import check_fits
 
 
 class Player:
@@ -85,7 +85,8 @@ class GivenObservations(VectorEnv):
     def _observations(self) -> Any:
         space = self.single_observation_space
         try:
-            return concatenate(space, [self.now[0]], create_empty_array(space, 1))
-        except (ValueError, TypeError, KeyError, IndexError):
-            made = "make the environment with the training's obs_type, options and constructor arguments"
-            raise ValueError(f"{self.spec.id}: this is no observation of {brief(space)}; {made}") from None
+            check_fits(space, self.now[0])
+        except ValueError as error:
+            hint = "make the environment with the training's obs_type, options and constructor arguments"
+            raise ValueError(f"{self.spec.id}: {error}; {hint}") from None
+        return concatenate(space, [self.now[0]], create_empty_array(space, 1))

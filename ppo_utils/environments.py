@@ -48,10 +48,10 @@ T = TypeVar("T")  # a script's Args
 
 def envs_for(args: Any, num_envs: int, **kwargs: Any) -> VectorEnv:
     """Make the environments that a script's arguments describe; kwargs and errors are those of `make_envs`."""
-    kwargs |= {name: getattr(args, name) for name in ("num_levels", "start_level", "obs_type")} | wrappers_of(args)
+    ours = {name: getattr(args, name) for name in ("num_levels", "start_level", "obs_type")} | wrappers_of(args)
     options, env_kwargs = parse_options(args.env_id, args.env_options), json_object("--env-kwargs", args.env_kwargs)
-    kwargs |= {"options": options or None, "env_kwargs": env_kwargs, "asynchronous": args.async_envs}
-    return make_envs(args.env_id, num_envs, **kwargs)
+    ours |= {"options": options or None, "env_kwargs": env_kwargs, "asynchronous": args.async_envs}
+    return make_envs(args.env_id, num_envs, **ours | kwargs)
 
 
 def wrappers_of(args: Any) -> dict[str, Any]:
@@ -131,18 +131,22 @@ def make_envs(
     with one_line_errors(f"{env_id} cannot be made"):
         envs = same_step_envs(spec, num_envs, kwargs, first_lane, Levels(start_level, num_levels), asynchronous)
 
-    envs = wrap_envs(envs, first_lane, **wrappers)
-    pictures = [name for name, part in envs.single_observation_space.items() if len(part.shape) == 3]
-    if obs_type == "vector" and pictures and not memory_gym:
-        print(f"{env_id} has no vectors to show instead of its {', '.join(pictures)}", file=sys.stderr)
+    try:
+        envs = wrap_envs(envs, first_lane, **wrappers)
+        pictures = [name for name, part in envs.single_observation_space.items() if len(part.shape) == 3]
+        if obs_type == "vector" and pictures and not memory_gym:
+            print(f"{env_id} has no vectors to show instead of its {', '.join(pictures)}", file=sys.stderr)
 
-    if seed is not None:
-        with one_line_errors(f"{env_id} cannot be reset"):
-            # Neighbouring seeds must not share lanes, so the lanes' seeds count up from a hash of the seed. It has 30
-            # bits, since some simulators take seeds below 2 ** 31 only.
-            envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0] >> 2) + first_lane)
-    # An explicit seed is a level of its own, which nobody plays: what counts episodes comes after it.
-    return EpisodeStatistics(envs)
+        if seed is not None:
+            with one_line_errors(f"{env_id} cannot be reset"):
+                # Neighbouring seeds must not share lanes, so the lanes' seeds count up from a hash of the seed, of 30
+                # bits, since some simulators take seeds below 2 ** 31 only.
+                envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0] >> 2) + first_lane)
+        # An explicit seed is a level of its own, which nobody plays: what counts episodes comes after it.
+        return EpisodeStatistics(envs)
+    except Exception:
+        envs.close()
+        raise
 
 
 def wrap_envs(
@@ -352,7 +356,7 @@ def branch_actions(envs: VectorEnv) -> VectorEnv:
 
 def env_actions(space: gym.Space, actions: np.ndarray) -> np.ndarray:
     """Turn actions (N, A), counted from 0, into the environment's own: (N,) for Discrete, (N, A) for MultiDiscrete."""
-    actions = actions + space.start  # the first action's number, 0 unless the space says otherwise
+    actions = (actions + space.start).astype(space.dtype)  # start is 0 unless the space says otherwise
     return actions[:, 0] if isinstance(space, gym.spaces.Discrete) else actions
 
 

@@ -73,7 +73,7 @@ def evaluate(
             metrics["return"] += rewards * playing
             metrics["length"] += playing
             for name, values in final_numbers(infos, done & playing).items():
-                if name not in ("return", "length"):  # counted above; the environment's own of these names are ignored
+                if name not in ("return", "length", "finished"):  # counted here; the environment's own are ignored
                     now = np.isfinite(values)
                     metrics.setdefault(name, np.full(len(levels), np.nan))[now] = values[now]
             playing &= ~done

@@ -8,6 +8,7 @@ import copy
 import functools
 import inspect
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+
+from memory_gym_envs.options import brief
+from ppo_utils.processes import RunError
 
 OWN = "own"  # where an info has what a lane's own info was
 
@@ -35,9 +39,9 @@ class Lane(gym.Wrapper):
     was last reset with, and the number of the step since then.
 
     A reset without a seed takes one of the levels, if there are any; which ones depends on the last seed that was
-    given. The last observation of an episode is a copy, since some environments return the same array at every step.
-    Infos are one object each, which Gymnasium does not try to make arrays of: its arrays have the type of the value
-    that comes first.
+    given. The last observation and info of an episode are copies, since some environments return the same arrays at
+    every step. Infos are one object each, which Gymnasium does not try to make arrays of: its arrays have the type of
+    the value that comes first. A reward may be an array of one number. Closing raises nothing.
     """
 
     def __init__(self, env: gym.Env, number: int, levels: Levels):
@@ -55,6 +59,7 @@ class Lane(gym.Wrapper):
             self._seed, self._steps = seed, 0
         try:
             observation, info = self.env.reset(seed=seed, options=options)
+            check_fits(self.observation_space, observation)
         except Exception as error:
             raise self._located(error, "the reset after step") from error
         return observation, {OWN: (dict(info),)}
@@ -64,16 +69,65 @@ class Lane(gym.Wrapper):
         self._steps += 1
         try:
             observation, reward, terminated, truncated, info = self.env.step(action)
+            check_fits(self.observation_space, observation)
+            if np.size(reward) != 1 or reward is None:
+                raise ValueError(f"the reward is {brief(reward)}, not a number")
         except Exception as error:
             raise self._located(error, "step") from error
         if terminated or truncated:
             observation = copy.deepcopy(observation)
-        return observation, reward, terminated, truncated, {OWN: (dict(info),)}
+            with contextlib.suppress(Exception):  # something in it cannot be copied
+                info = copy.deepcopy(info)
+        return observation, np.asarray(reward).item(), terminated, truncated, {OWN: (dict(info),)}
+
+    def close(self) -> None:
+        """Close the environment; what it raises is a line on stderr, since nothing that follows needs it."""
+        try:
+            super().close()
+        except Exception as error:
+            print(f"environment {self._number} raised {error!r} when it was closed", file=sys.stderr)
 
     def _located(self, error: Exception, where: str) -> RuntimeError:
         began = "it was made, never reset with a seed" if self._seed is None else f"its reset with seed {self._seed}"
         what = f"{type(error).__name__} in {where} {self._steps} since {began}"
         return RuntimeError(": ".join(filter(None, [f"environment {self._number} raised {what}", one_line(error)])))
+
+
+class AsyncLanes(AsyncVectorEnv):
+    """Lanes in processes of their own. One that dies is a RunError; after an error, closing waits for none of them."""
+
+    def __init__(self, lanes: list[Callable[[], gym.Env]]):
+        self._pending = False  # a call has begun, and has not come to its end
+        # Not all spaces can be in shared memory.
+        super().__init__(lanes, autoreset_mode=AutoresetMode.SAME_STEP, shared_memory=False)
+
+    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+        """Reset all lanes."""
+        with self._alive():
+            return super().reset(**arguments)
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Step all lanes."""
+        with self._alive():
+            return super().step(actions)
+
+    def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
+        """End all processes, at once if a call has failed: its answers may never come."""
+        super().close_extras(timeout, terminate or self._pending)
+
+    @contextlib.contextmanager
+    def _alive(self) -> Iterator[None]:
+        self._pending = True
+        try:
+            yield
+            self._pending = False
+        except (EOFError, ConnectionError) as error:
+            for lane, process in enumerate(self.processes):
+                process.join(1)
+                if process.exitcode is not None:
+                    code = process.exitcode
+                    raise RunError(f"the process of environment {lane} ended, with exit code {code}") from error
+            raise
 
 
 def same_step_envs(
@@ -94,10 +148,8 @@ def same_step_envs(
         raise ValueError(f"{spec.id} has no single environments, which --async-envs needs")
     check_kwargs(spec.id, creator(spec.entry_point), kwargs)
     make = functools.partial(make_lane, spec, kwargs, levels, asynchronous)
-    kind = AsyncVectorEnv if asynchronous else SyncVectorEnv
     lanes = [functools.partial(make, first_lane + lane) for lane in range(num_envs)]
-    more = {"shared_memory": False} if asynchronous else {}  # which not all spaces can have
-    envs = kind(lanes, autoreset_mode=AutoresetMode.SAME_STEP, **more)
+    envs = AsyncLanes(lanes) if asynchronous else SyncVectorEnv(lanes, autoreset_mode=AutoresetMode.SAME_STEP)
     envs.spec = spec
     return envs
 
@@ -109,8 +161,26 @@ def make_lane(spec: EnvSpec, kwargs: dict[str, Any], levels: Levels, asynchronou
     return Lane(gym.make(spec, **kwargs), number, levels)
 
 
+def check_fits(space: gym.Space, observation: Any, name: str = "observation") -> None:
+    """Raise ValueError if an observation has not the keys, shapes or kinds of numbers of its space."""
+    if isinstance(space, (gym.spaces.Dict, gym.spaces.Tuple)):
+        parts = space.spaces if isinstance(space, gym.spaces.Dict) else dict(enumerate(space.spaces))
+        for key, part in parts.items():
+            try:
+                inside = observation[key]
+            except (KeyError, IndexError, TypeError):
+                raise ValueError(f"{name} has no {key!r}: {brief(observation)}") from None
+            check_fits(part, inside, f"{name}.{key}")
+    elif isinstance(space, (gym.spaces.Box, gym.spaces.Discrete, gym.spaces.MultiDiscrete, gym.spaces.MultiBinary)):
+        array = np.asarray(observation)
+        if array.shape != space.shape or not np.can_cast(array.dtype, space.dtype, "same_kind"):
+            raise ValueError(
+                f"{name} is of {array.dtype}, shape {array.shape}, and its space {space.dtype}, {space.shape}"
+            )
+
+
 def check_kwargs(env_id: str, create: Callable, kwargs: dict[str, Any]) -> None:
-    """Raise ValueError if the environment's constructor does not take an argument; render_mode is Gymnasium's."""
+    """Raise ValueError if neither the environment's constructor nor gym.make takes an argument."""
     try:
         parameters = inspect.signature(create).parameters
     except ValueError:  # of a class that is not written in Python
@@ -118,7 +188,7 @@ def check_kwargs(env_id: str, create: Callable, kwargs: dict[str, Any]) -> None:
     if any(each.kind is inspect.Parameter.VAR_KEYWORD for each in parameters.values()):
         return
     taken = [name for name in parameters if name not in ("self", "render_mode")]
-    for name in kwargs.keys() - {*taken, "render_mode"}:
+    for name in kwargs.keys() - {*taken, "render_mode", "max_episode_steps"}:  # Gymnasium's own
         raise ValueError(f"{env_id} has no argument {name!r}; it has {', '.join(taken) or 'none'}")
 
 

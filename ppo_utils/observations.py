@@ -19,6 +19,7 @@ from ppo_utils.processes import RunError
 from ppo_utils.wrappers import OBSERVATION, one_hot
 
 SMALLEST_PICTURE = 36  # pixels along a side; what is smaller becomes a vector
+WRITABLE = ("C_CONTIGUOUS", "WRITEABLE")  # wrappers overwrite observations in place
 INFOS = ("own", "ground_truth", "_ground_truth", "final_obs", "_final_obs", "final_info", "_final_info")
 
 
@@ -167,13 +168,14 @@ class Part:
         if self.axes is not None:
             values = self._as_picture(np.asarray(values))
             if self._is_bytes:
-                return np.ascontiguousarray(values, np.uint8)
+                return np.require(values, np.uint8, WRITABLE)
             low, high = self.bounds
-            return finite(np.ascontiguousarray((values - low) / ((high - low) or 1.0), np.float32))
+            return finite(np.require((values - low) / ((high - low) or 1.0), np.float32, WRITABLE))
         rows = np.reshape(values, (len(values), -1))
         if isinstance(self.leaf, (gym.spaces.Discrete, gym.spaces.MultiDiscrete)):
-            first = np.ravel(self.leaf.start)
+            first = np.ravel(self.leaf.start).astype(np.int64)
             sizes = np.ravel(self.leaf.n if isinstance(self.leaf, gym.spaces.Discrete) else self.leaf.nvec)
+            sizes = sizes.astype(np.int64)
             wrong = (rows < first) | (rows >= first + sizes)
             if wrong.any():
                 row, entry = np.argwhere(wrong)[0].tolist()
@@ -181,7 +183,7 @@ class Part:
                 raise WrongValue(row, f"is {rows[row, entry]}, outside of {first[entry]} to {last}")
             return one_hot(rows - first, sizes)
         with np.errstate(over="ignore"):
-            return finite(np.ascontiguousarray(rows, np.float32))
+            return finite(np.require(rows, np.float32, WRITABLE))
 
     def _as_picture(self, values: np.ndarray) -> np.ndarray:
         """Move height and width of (n, ...) to the front, and join all other axes as channels: (n, H, W, C)."""

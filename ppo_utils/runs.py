@@ -163,7 +163,7 @@ def open_run(args: Any, run: Run, checkpoint: dict[str, Any] | None) -> Run:
     rank, _ = rank_and_size()
     if args.eval_interval and rank == 0:
         with report_out_of_memory(args, torch.device("cpu")):
-            run.eval_envs = envs_for(args, args.eval_levels * REPEATS)
+            run.eval_envs = envs_for(args, args.eval_levels * REPEATS, asynchronous=False)
     if rank > 0:  # all processes began with the same weights, but draw numbers of their own
         seed_generators(int(np.random.SeedSequence([args.seed, rank]).generate_state(1)[0]))
     if args.load_model is not None and checkpoint is None:

@@ -28,8 +28,10 @@ import memory_gym_envs
 import ppo_gru
 import ppo_trxl
 from memory_gym_envs.character import PAD
+from memory_gym_envs.mystery_path import ROWS
 from ppo_utils.checkpoints import make_agent
 from ppo_utils.environments import as_tensors, envs_for
+from ppo_utils.evaluation import most_probable
 
 AGENTS = {
     "GRU": (ppo_gru, {"env_id": "MysteryPath-Grid-v0", "reconstruction_coef": 0.1, "ground_truth_coef": 0.1}),
@@ -45,7 +47,7 @@ AGENTS = {
 def saved(tiny):
     """Save an agent with random weights as model.pt, and return its arguments."""
 
-    def save(script=ppo_gru, **changes):
+    def save(script=ppo_gru, path="model.pt", **changes):
         args = tiny(script, **{"env_id": "MysteryPath-Grid-v0", **changes})
         torch.manual_seed(1)
         envs = envs_for(args, 1)
@@ -55,19 +57,32 @@ def saved(tiny):
             for parameter in agent.heads.parameters():
                 parameter.mul_(3)
         saved = {"script": script.__name__, "args": dataclasses.asdict(args), "weights": agent.state_dict()}
-        torch.save(saved, "model.pt")
+        torch.save(saved, path)
         return args
 
     return save
 
 
-def played(seed=3, max_steps=60):
-    agent, envs, _ = enjoy.load("model.pt")
+def played(seed=3, max_steps=60, env_options=None):
+    agent, envs, _ = enjoy.load("model.pt", env_options)
     return enjoy.play(agent, envs, seed, max_steps)
 
 
 def data_of(page):
     return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)[1])
+
+
+def page_of(**config):
+    """What the page of this command holds."""
+    enjoy.main(enjoy.Config(**{"checkpoint": "model.pt", "seed": 3, "max_steps": 60, **config}))
+    return data_of(Path("page.html").read_text())
+
+
+def weights_of(page):
+    """The attention weights (T, K, H, M) of an episode on the page."""
+    attention = page["attention"]
+    packed = np.frombuffer(base64.b64decode(attention["weights"]), np.uint8)
+    return (packed.reshape(-1, attention["blocks"], attention["heads"], attention["window"]) / 255) ** 2
 
 
 def picture(url):
@@ -87,11 +102,10 @@ def test_every_kind_of_agent(name, saved):
     script, changes = AGENTS[name]
     args = saved(script, **changes)
     line = enjoy.main(enjoy.Config("model.pt", seed=3, max_steps=60))
-    with open("page.html") as file:
-        page = data_of(file.read())
+    (page,) = data_of(Path("page.html").read_text())["episodes"]
     steps = page["steps"]
     assert line.startswith(f"page.html: {steps} steps, return {page['facts']['return']}, ")
-    assert page["facts"]["agent"] == ("GRU" if name == "CartPole" else name)
+    assert page["facts"]["memory"].split(",")[0] == ("GRU" if name == "CartPole" else name)
     assert all(len(each) == steps for each in (page["actions"], *page["lines"].values()))
     names = ["rendered frame" if name in ("GTrXL", "CartPole") else "agent's view"]
     names += ["ground truth"] * (name != "CartPole") + ["reconstruction"] * bool(args.reconstruction_coef)
@@ -111,7 +125,7 @@ def test_the_episode_is_the_agents(flags, saved, monkeypatch):
     saved(ppo_trxl, env_id="MortarMayhem-Grid-v0", **flags)
     agent, envs, _ = enjoy.load("model.pt")
     episode = enjoy.play(agent, envs, 3, 60)
-    page = enjoy.page_data(episode, "MortarMayhem-Grid-v0", {})
+    page = enjoy.episode_data(episode, "MortarMayhem-Grid-v0", {})
     view, truth = map(frames_of, page["videos"])
     used, forward = [], ppo_trxl.Attention.forward
 
@@ -186,22 +200,225 @@ def test_seed_is_the_level_and_the_actions(saved):
     assert first == again != other
 
 
-def test_default_level_was_not_trained_on(saved):
+def test_default_level_was_not_trained_on(saved, tmp_path):
     saved(num_levels=7, start_level=5)
-    enjoy.main(enjoy.Config("model.pt", max_steps=2))
-    with open("page.html") as file:
-        facts = data_of(file.read())["facts"]
-    assert facts == {"agent": "GRU", "seed": 12, "steps": 2, "return": "0", "cut short": "after 2 steps"}
+    (page,) = page_of(seed=None, max_steps=2)["episodes"]
+    facts = {"agent": f"{tmp_path.name}/model.pt", "memory": "GRU, 1 x 32 units", "actions": "sampled", "seed": 12}
+    assert page["facts"] == facts | {"steps": 2, "return": "0", "cut short": "after 2 steps"}
+
+
+def test_most_probable_actions(saved):
+    saved(env_id="MortarMayhem-v0", obs_type="vector")
+    (page,) = page_of(deterministic=True, max_steps=40)["episodes"]
+    agent, envs, _ = enjoy.load("model.pt")
+    obs, _ = envs.reset(seed=3)
+    memory = agent.memory.initial_state(1, 40, torch.device("cpu"))
+    for actions in page["actions"]:
+        with torch.no_grad():
+            assert most_probable(agent, as_tensors(obs, torch.device("cpu")), memory).tolist() == [actions]
+        obs, *_ = envs.step(np.array([actions]))
+    assert page["facts"]["actions"] == "most probable"
+    assert page_of(max_steps=40)["episodes"][0]["actions"] != page["actions"]
+
+
+SHORT = {"command_count": [2], "command_show_duration": [1], "command_show_delay": [0]}
+
+
+def test_options_go_over_those_of_the_training(saved):
+    saved(env_id="MortarMayhem-Grid-v0", env_options='{"command_count": [3], "arena_size": 4}')
+    page = page_of(env_options=json.dumps(SHORT))
+    assert page["options"] == {**SHORT, "arena_size": 4}
+    assert page["episodes"][0]["events"]["command shown"] == [0, 1]
+    assert page_of()["options"] == {"command_count": [3], "arena_size": 4}
+    with pytest.raises(ValueError, match="--env-options is no JSON"):
+        page_of(env_options="{")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "name", "value", "shown"),
+    [
+        ("MortarMayhem-Grid-v0", "commands_completed", 1.0, "100 %"),
+        ("Endless-MortarMayhem-v0", "commands_completed", 1.0, "1"),
+        ("SearingSpotlights-v0", "coins_collected", 0.5, "50 %"),
+        ("Endless-SearingSpotlights-v0", "coins_collected", 2.0, "2"),
+        ("Endless-SearingSpotlights-v0", "agent_health", 0.25, "25 %"),
+        ("MysteryPath-v0", "success", 1.0, "1"),
+    ],
+)
+def test_shares_and_counts(env_id, name, value, shown):
+    episode = enjoy.Episode(rewards=[1.0], final={name: value, "length": 1.0}, finished=True)
+    assert enjoy.outcome(episode, env_id)[name.replace("_", " ")] == shown
+
+
+def named_truth(env_id, seed):
+    """The ground truth of a level's first step by the names on the page, and the state that it is of."""
+    env = gym.make(env_id).unwrapped
+    _, info = env.reset(seed=seed)
+    episode = enjoy.Episode(policy=[[np.ones(3), np.ones(3)]], actions=[[0, 0]], truth=[info["ground_truth"]])
+    data = enjoy.episode_data(episode, env_id, {})
+    return dict(zip(data["truth_names"], data["truth"][0], strict=True)), env.batch.state
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("env_id", memory_gym_envs.IDS)
+def test_what_the_ground_truth_is_called(env_id, seed):
+    truth, s = named_truth(env_id, seed)
+    if "MortarMayhem" in env_id:
+        x, y = s.target_corner[0] - s.target_corner.min()
+        assert list(truth) == ["column", "row"]
+        assert np.sign(truth["column"] - truth["row"]) == np.sign(x - y)
+    elif "MysteryPath" in env_id:
+        directions = {ROWS: "right", -1: "up", 1: "down", -ROWS: "left"}
+        assert [name for name, hot in truth.items() if hot] == [directions[s.path_cell[0, 2] - s.path_cell[0, 1]]]
+    else:
+        places = {"agent": s.bodies[:, 0, 0], "coin": s.targets[0, :2], "exit": s.targets[0, 2:]}
+        for name, value in truth.items():
+            assert value == pytest.approx(places[name[:-2]]["xy".index(name[-1])] / 84, abs=1e-5)
+
+
+def test_what_sets_agents_apart(tiny):
+    """Two transformers have other names if their attention differs."""
+    changes = [{}, {"trxl_positional_encoding": "none"}, {"trxl_query_output": True}, {"trxl_layer_norm": "post"}]
+    changes += [{"trxl_memory_length": 8}, {"trxl_num_heads": 4}, {"frame_stack": 4}, {"trxl_gate": "gru"}]
+    names = [enjoy.memory_of(tiny(ppo_trxl, **change)) for change in changes]
+    assert names[1] == "TrXL, 2 blocks, 2 heads, width 32, window 7, no positional encoding, pre-norm"
+    assert names[2].endswith("absolute positional encoding, pre-norm, query output")
+    assert names[6].endswith("pre-norm, frame stack 4")
+    assert len({*names}) == len(names)
+
+
+# ---- events ----
+def test_commands_and_failures():
+    agent, envs, _ = enjoy.load(Path(__file__).parents[1] / "agents/endless-mortar-mayhem-gru.pt")
+    episode = enjoy.play(agent, envs, 100_000, 500)
+    assert len(episode.events["command completed"]) == episode.final["commands_completed"] > 3
+    # A sequence also grows by a last command that failed, which ends the episode before the next is shown.
+    assert len(episode.events["command shown"]) - episode.final["max_command_sequence"] in (0, 1)
+    assert episode.events["failure"] == [len(episode.actions) - 1]
+
+
+def test_falls(saved):
+    saved()
+    episode = played(max_steps=500)
+    falls = episode.events["fell off"]
+    assert episode.final["num_fails"] - len(falls) in (0, 1)  # a last one has no frame
+    assert len(falls) > 1
+    assert episode.events["failure"] == []
+
+
+def test_spotlights(saved):
+    saved(env_id="SearingSpotlights-v0", env_options='{"agent_health": 10, "light_threshold": 0}')
+    for seed in range(20):
+        episode = played(seed, 500)
+        if episode.final["agent_health"] == 0:
+            assert len(episode.events["in a spotlight"]) == 9  # the tenth hit has no frame
+            assert episode.events["failure"] == [len(episode.actions) - 1]
+            break
+    else:
+        raise AssertionError("no episode was failed")
+
+
+def test_other_environments_have_no_events(saved):
+    saved(env_id="CartPole-v1")
+    assert played().events == {}
+
+
+# ---- several episodes ----
+def test_agents_and_levels(saved):
+    saved(num_levels=5)
+    saved(ppo_trxl, "other.pt", num_levels=7)
+    page = page_of(others=("other.pt", "model.pt"), levels=2, seed=None)
+    facts = [(each["facts"]["agent"].split("/")[1], each["facts"]["seed"]) for each in page["episodes"]]
+    assert facts == [("model.pt", 7), ("other.pt", 7), ("model.pt", 8), ("other.pt", 8)]
+    for each, (name, seed) in zip(page["episodes"], facts, strict=True):
+        (alone,) = page_of(checkpoint=name, seed=seed)["episodes"]
+        assert alone == each
+
+
+def test_agents_of_other_tasks(saved):
+    saved()
+    saved(path="other.pt", env_options='{"max_steps": 9}')
+    with pytest.raises(ValueError, match=r"other\.pt plays another task than model\.pt"):
+        page_of(others=("other.pt",))
+    assert len(page_of(others=("other.pt",), env_options='{"max_steps": 9}')["episodes"]) == 2
+
+
+# ---- environments of other packages ----
+ODD = """
+import gymnasium as gym
+import numpy as np
+
+FRAMES = {"floats": np.full((2, 3, 3), 0.5), "gray": np.full((2, 3), 127, np.uint8), "list": [[[127] * 3] * 3] * 2}
+
+
+class Odd(gym.Env):
+    metadata = {"render_modes": ["rgb_array"]}
+    observation_space, action_space = gym.spaces.Box(0, 1, (1,)), gym.spaces.Discrete(2)
+
+    def __init__(self, render_mode=None, frame=None, reward=1.0):
+        self.render_mode, self.frame, self.reward = render_mode, frame, reward
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), float(self.reward), False, False, {}
+
+    def render(self):
+        return FRAMES.get(self.frame)
+
+
+gym.register("Odd-v0", Odd)
+"""
+
+
+@pytest.fixture
+def odd(saved):
+    """Save the agent of an environment with these arguments."""
+    Path("odd_pictures.py").write_text(ODD)
+    yield lambda **kwargs: saved(env_id="odd_pictures:Odd-v0", env_kwargs=json.dumps(kwargs))
+    sys.modules.pop("odd_pictures", None)
+    gym.registry.pop("Odd-v0", None)
+
+
+@pytest.mark.parametrize("frame", ["floats", "gray", "list"])
+def test_pictures_of_every_kind(frame, odd):
+    odd(frame=frame)
+    page = page_of(max_steps=2)
+    (video,) = page["episodes"][0]["videos"]
+    assert frames_of(video).tolist() == np.full((2, 2, 3, 3), 127).tolist()
+    assert page["options"] == {"frame": frame}
+
+
+def test_no_pictures(odd):
+    odd()
+    with pytest.raises(ValueError, match=r"Odd-v0 draws no pictures \(render_mode rgb_array\)"):
+        page_of()
+
+
+def test_what_an_environment_does_wrong_is_one_line(odd):
+    odd(frame="gray", reward="nan")
+    made = subprocess.run([sys.executable, enjoy.__file__, "model.pt"], capture_output=True, text=True)
+    assert (made.returncode, made.stdout) == (1, "")
+    assert "Traceback" not in made.stderr
+    assert made.stderr.splitlines()[-1].startswith("enjoy.py: Odd-v0: the reward is nan (environment 0, step 1 ")
 
 
 # ---- how it is packed ----
 def test_attention_is_packed_by_age():
     looks = [np.zeros((1, 2, 1)), np.array([[[1.0], [1.0]]]), np.array([[[0.25, 0.75], [0.75, 0.25]]])]
     looks.append(np.array([[[0.0, 1.0], [0.5, 0.5]]]))  # a window of two
-    packed = enjoy.packed(looks)
-    scores = np.frombuffer(base64.b64decode(packed["scores"]), "<u2").reshape(4, 1, 2)[:, 0] / 65535 * packed["heads"]
-    assert np.allclose(scores, [[0, 0], [0, 2], [1, 1], [0.5, 1.5]], atol=1e-4)
+    weights = weights_of({"attention": enjoy.packed(looks)})[:, 0]
+    rows = [[[0, 0], [0, 0]], [[0, 1], [0, 1]], [[0.25, 0.75], [0.75, 0.25]], [[0, 1], [0.5, 0.5]]]
+    assert np.allclose(weights, rows, atol=4e-3)
     assert enjoy.packed([]) is None
+
+
+def test_small_weights_keep_their_digits():
+    """Those of a uniform attention to 256 steps still add up to one."""
+    weights = weights_of({"attention": enjoy.packed([np.full((1, 1, 256), 1 / 256)])})
+    assert weights.sum() == pytest.approx(1, abs=0.02)
 
 
 def test_displayable():
@@ -216,9 +433,10 @@ def test_displayable():
 
 def test_text_in_the_data_cannot_end_the_script():
     episode = enjoy.Episode(policy=[[np.ones(1)]], actions=[[0]], values=[0.0], entropies=[0.0], rewards=[0.0])
-    page = enjoy.page(enjoy.page_data(episode, "CartPole-v1", {"</script>": "<!--"}), "")
+    data = enjoy.episode_data(episode, "CartPole-v1", {"</script>": "<!--"})
+    page = enjoy.page({"title": "CartPole-v1", "episodes": [data]}, "")
     assert page.count("</script>") == 3
-    assert data_of(page)["facts"] == {"</script>": "<!--"}
+    assert data_of(page)["episodes"][0]["facts"] == {"</script>": "<!--"}
 
 
 def test_the_page_is_installed_with_the_module(tmp_path):
@@ -241,7 +459,7 @@ def test_a_thousand_steps_stay_small(saved):
     window = {"trxl_memory_length": 256, "trxl_num_layers": 3, "reconstruction_coef": 0.1}
     saved(ppo_trxl, env_id="Endless-SearingSpotlights-v0", env_options=options, **window)
     assert enjoy.main(enjoy.Config("model.pt", seed=3, max_steps=100)).startswith("page.html: 100 steps")
-    library, longest_look = len(enjoy.get_plotlyjs()), 3 * 256 * 2 * 4 / 3  # three blocks, two bytes, in base64
+    library, longest_look = len(enjoy.get_plotlyjs()), 3 * 4 * 256 * 4 / 3  # three blocks, four heads, in base64
     assert library + 10 * (os.path.getsize("page.html") - library) + 1000 * longest_look < 15e6
 
 
@@ -274,11 +492,13 @@ def watch(browser, saved, tmp_path_factory):
 
     def open_page(step):
         if not path.exists():
-            saved(ppo_trxl, env_id="MortarMayhem-Grid-v0", trxl_memory_length=128)
-            enjoy.main(enjoy.Config("model.pt", seed=3, out=str(path)))
+            options = '{"command_count": [16]}'  # 64 steps to show them
+            saved(ppo_trxl, env_id="MortarMayhem-Grid-v0", trxl_memory_length=128, env_options=options)
+            saved(path="other.pt", env_id="MortarMayhem-Grid-v0", env_options=options)
+            enjoy.main(enjoy.Config("model.pt", ("other.pt",), seed=3, out=str(path)))
         browser.get("about:blank")  # or the same page at another step would not be loaded anew
         browser.get(f"{path.as_uri()}#{step}")
-        page = data_of(path.read_text())
+        page = data_of(path.read_text())["episodes"][0]
         return page, [frames_of(video) for video in page["videos"]]
 
     yield open_page
@@ -334,13 +554,17 @@ def test_click_on_a_line(browser, watch):
         check_step(browser, videos, step)
 
 
-def test_click_on_an_attention_score(browser, watch):
+def points_of_block(block):
+    """Where the marks of a block's highest weights are: the rows above it are three curves and the actions."""
+    return f"#curves .xy{5 + block} .points .point"
+
+
+def test_click_on_an_attention_weight(browser, watch):
     page, videos = watch(40)
-    look = page["attention"]
-    scores = np.frombuffer(base64.b64decode(look["scores"]), "<u2").reshape(page["steps"], 2, -1)
+    weights = weights_of(page).sum(2)
     for block, i in ((0, 0), (1, 9)):
-        best = np.argsort(-scores[40, block].astype(int))[:16] + 40 - look["items"]
-        x, y, width, height = place(browser, "#curves .scatterlayer .points .point", 16 * block + i)
+        best = np.argsort(-weights[40, block], kind="stable")[:10] + 40 - page["attention"]["window"]
+        x, y, width, height = place(browser, points_of_block(block), i)
         point(browser, x + width / 2, y + height / 2)
         check_shown(browser, videos, best[i])
         point(browser, 0, 0)
@@ -350,6 +574,91 @@ def test_click_on_an_attention_score(browser, watch):
         press(browser, Keys.HOME)
         ActionChains(browser).key_down(Keys.SHIFT).send_keys(*[Keys.ARROW_RIGHT] * 4).key_up(Keys.SHIFT).perform()
         check_step(browser, videos, 40)
+
+
+def choose(browser, name, value):
+    Select(browser.find_element("id", name)).select_by_value(value)
+
+
+def trace(browser, expression):
+    """A part of a trace of the curves; the traces of attention are at firstBlock and after."""
+    return browser.execute_script(f"return find('#curves').data{expression}")
+
+
+def y_range(browser, row):
+    return browser.execute_script(f"return find('#curves').layout.yaxis{row}.range")
+
+
+def test_axis_of_attention_stays(browser, watch):
+    page, _ = watch(5)
+    largest = weights_of(page).sum(2)[min(16, page["steps"] // 4) :].max((0, 2))
+    assert largest[0] != pytest.approx(largest[1])
+    for step in (5, 20, 40):
+        browser.execute_script(f"go({step})")
+        for block in (0, 1):
+            assert y_range(browser, 5 + block) == pytest.approx([0, 1.08 * largest[block]])
+
+
+@pytest.mark.parametrize(("step", "marks"), [(1, 1), (8, 2), (40, 10), (66, 16)])
+def test_highest_weights_are_marked(step, marks, browser, watch):
+    watch(step)
+    for block in (0, 1):
+        assert len(browser.find_elements("css selector", points_of_block(block))) == marks
+    assert "highest quarter, at most 16" in browser.find_element("id", "top-only").text
+
+
+def test_one_head(browser, watch):
+    page, _ = watch(40)
+    weights = weights_of(page)[40, 1, :, -40:]
+    assert np.allclose(trace(browser, "[firstBlock + 2].y"), weights.sum(0))
+    choose(browser, "head", "1")
+    assert np.allclose(trace(browser, "[firstBlock + 2].y"), weights[1])
+    names = [each.text for each in browser.find_elements("css selector", "#curves .annotation-text")]
+    assert names[-2:] == ["attention of block 1, head 2", "attention of block 2, head 2"]
+
+
+def test_heat_map(browser, watch):
+    page, videos = watch(40)
+    steps, weights = page["steps"], weights_of(page)[:, 0].sum(1)
+    choose(browser, "view", "map")
+    shown = trace(browser, "[firstBlock].z")
+    assert [[each is None for each in row] for row in shown] == [[s >= t for s in range(steps)] for t in range(steps)]
+    for t in (1, 40, steps - 1):
+        assert np.allclose(shown[t][:t], weights[t, -t:])
+    assert not browser.find_element("id", "top-only").is_displayed()
+    x, y, width, height = place(browser, "#curves .xy5 .hm image", 0)
+    click(browser, x + width * 12.5 / steps, y + height / 2)
+    check_step(browser, videos, 12)
+
+
+def test_events_and_actions(browser, watch):
+    page, _ = watch(5)
+    shown = page["events"]["command shown"]
+    assert trace(browser, "[3].x") == shown
+    assert trace(browser, "[3].y") == [page["lines"]["state value"][step] for step in shown]
+    (branch,) = page["branches"]
+    taken = [branch["actions"][action] for (action,) in page["actions"]]
+    assert trace(browser, "[firstBlock - 1].text") == [taken]
+    assert trace(browser, "[firstBlock - 1].z") == [[action for (action,) in page["actions"]]]
+    legend = browser.find_element("id", "legend").text.split("\n")
+    assert legend[0] == "◆ command shown"
+    assert legend[-4:] == ["■ none", "■ turn left", "■ turn right", "■ forward"]
+
+
+def test_another_episode(browser, watch, tmp_path_factory):
+    watch(20)
+    page = data_of((tmp_path_factory.getbasetemp() / "watched.html").read_text())
+    assert browser.find_element("id", "options").text == "command_count [16]"
+    other = page["episodes"][1]
+    choose(browser, "episode", "1")
+    check_step(browser, [frames_of(video) for video in other["videos"]], 20)
+    texts = [each.text for each in browser.find_elements("css selector", "#bars .bartext")]
+    assert texts == [f"{each:.2f}" for each in other["branches"][0]["probabilities"][20]]
+    facts = [each.text for each in browser.find_elements("css selector", "header span")]
+    assert facts == [f"{name} {value}" for name, value in other["facts"].items()]
+    assert not browser.find_element("id", "attention").is_displayed()
+    press(browser, Keys.ARROW_RIGHT)  # of the video, not of the list
+    assert step_of(browser) == 21
 
 
 def test_keys(browser, watch):
@@ -371,11 +680,11 @@ def test_keys(browser, watch):
     assert browser.switch_to.active_element.tag_name == "body"
     press(browser, Keys.SPACE)  # pauses, and does not press the button again
     assert button.text == "Play"
-    Select(browser.find_element("tag name", "select")).select_by_value("25")
+    choose(browser, "speed", "25")
     press(browser, Keys.HOME, Keys.ARROW_RIGHT)  # of the video, not of the list
     check_step(browser, videos, 1)
     press(browser, Keys.SPACE)
-    WebDriverWait(browser, 10).until(lambda _: button.text == "Play")  # stops at the end
+    WebDriverWait(browser, 60).until(lambda _: button.text == "Play")  # stops at the end
     check_step(browser, videos, page["steps"] - 1)
 
 
@@ -388,18 +697,61 @@ def test_bars_and_numbers_are_those_of_the_step(browser, watch):
     )
     red, blue = "rgb(200, 85, 61)", "rgb(185, 203, 220)"
     assert colors == [red if action == page["actions"][7][0] else blue for action in range(4)]
-    row = browser.find_element("css selector", "#truth tr").text
-    assert row == " ".join(["true", *(f"{each:.3f}" for each in page["truth"][7])])
+    table = [row.text for row in browser.find_elements("css selector", "#truth tr")]
+    assert table == ["column row", " ".join(["true", *(f"{each:.3f}" for each in page["truth"][7])])]
 
 
-def test_narrow_window(browser, watch):
-    watch(3)
-    browser.set_window_size(500, 900)
+def test_numbers_as_names_of_actions(browser, saved, tmp_path):
+    saved(env_id="CartPole-v1")
+    page_of()
+    browser.get((tmp_path / "page.html").as_uri())
+    assert [each.text for each in browser.find_elements("css selector", "#bars .xtick")] == ["0", "1"]
+
+
+@pytest.mark.parametrize("width", [1920, 1280, 700, 400])
+def test_every_width(width, browser, watch):
+    """Nothing is wider than its card: if the window has this width, comes to have it, or the page becomes narrower."""
+    wide = """const right = element => element.getBoundingClientRect().right;
+        const parts = card => [...card.querySelectorAll(":scope *:not(svg *)")];
+        const spills = card => parts(card).some(part => right(part) > right(card));
+        return document.documentElement.scrollWidth > innerWidth ||
+            [...document.querySelectorAll("section")].some(spills)"""
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
     try:
-        fits = "return document.documentElement.scrollWidth <= innerWidth"
-        WebDriverWait(browser, 10).until(lambda _: browser.execute_script(fits))
+        for _ in range(2):
+            watch(3)
+            browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+            WebDriverWait(browser, 10).until(lambda _: not browser.execute_script(wide))
+        browser.execute_script(f"document.body.style.width = '{width - 50}px'")
+        WebDriverWait(browser, 10).until(lambda _: not browser.execute_script(wide))
+        browser.execute_script("document.body.style.width = ''")
+        left, plots = (place(browser, card, 0) for card in ("#left", "#plots"))
+        if width > 900:
+            assert left[2] > 0.3 * width
+            assert left[3] > 0.6 * plots[3]
+        else:
+            assert left[2] == plots[2] > 0.85 * width
     finally:
-        browser.set_window_size(1400, 1000)
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_dark_mode(browser, watch):
+    """It begins when the system changes to it; all text and lines then have other colors than the background."""
+    script = """const style = selector => getComputedStyle(document.querySelector(selector));
+        return [style("body").backgroundColor, style("#plots").backgroundColor, style("h1").color,
+            style("#curves .xtick text").fill, style("#bars .ytick text").fill, style("#curves .js-line").stroke]"""
+    watch(3)
+    light = browser.execute_script(script)
+    dark_mode = {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", dark_mode)
+    try:
+        WebDriverWait(browser, 10).until(lambda _: browser.execute_script(script)[-1] != light[-1])
+        dark = browser.execute_script(script)
+    finally:
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    brightness = [[sum(map(int, re.findall(r"\d+", color)[:3])) for color in colors] for colors in (light, dark)]
+    assert min(brightness[0][:2]) - max(brightness[0][2:]) > 200
+    assert min(brightness[1][2:]) - max(brightness[1][:2]) > 200
 
 
 # ---- bad input ----
@@ -415,7 +767,9 @@ def test_bad_input_is_one_line(saved):
     ("config", "message"),
     [
         ({"checkpoint": enjoy.__file__}, "enjoy.py is cut short, or neither a model nor a checkpoint"),
-        ({"seed": -1}, "--seed is -1; it must be from 0 to 2 ** 63 - 1"),
+        ({"seed": -1}, "--seed is -1; levels must be from 0 to 2 ** 63 - 1"),
+        ({"seed": 2**63 - 1, "levels": 2}, "--seed is 9223372036854775807; levels must be from 0 to 2 ** 63 - 1"),
+        ({"levels": 0}, "--levels is 0; it must be from 1 to 100"),
         ({"max_steps": 0}, "--max-steps is 0; it must be from 1 to 100000"),
         ({"out": "nowhere/page.html"}, "there is no folder nowhere"),
         ({"out": "."}, "directory"),

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import SCRIPTS, parse_args
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from test_environments import box, register, roll
 
 import ppo_gru
@@ -360,7 +360,7 @@ def test_constructor_arguments(tiny):
 
 
 @pytest.mark.parametrize(("env_id", "text", "message"), [
-    (register(Sized), '{"sise": 9}', "has no argument 'sise'; it has size, color"),
+    (register(Sized), '{"sizes": 9}', "has no argument 'sizes'; it has size, color"),
     ("CartPole-v1", '{"size": 9}', "CartPole-v1 has no argument 'size'; it has sutton_barto_reward"),
     ("CartPole-v1", "[9]", '--env-kwargs must be a JSON object such as {"size": 9}, not [9]'),
     ("CartPole-v1", "{size", "--env-kwargs is no JSON"),
@@ -526,3 +526,156 @@ def test_actions_are_the_environments_own():
     assert env_actions(gym.spaces.Discrete(3, start=5), np.array([[2], [0]])).tolist() == [7, 5]
     branches = gym.spaces.MultiDiscrete([2, 3], start=[1, 0])
     assert env_actions(branches, np.array([[1, 2]])).tolist() == [[2, 2]]
+
+
+# ---- what environments do wrong, or differently ----
+def test_an_info_that_is_reused():
+    """Its arrays are overwritten by the reset that follows an episode's end."""
+    info = {"score": np.zeros(1)}
+
+    def tell(env):
+        info["score"][:] = env.t
+        return info
+
+    envs = make_envs(small(tell=tell), 2, seed=1)
+    envs.reset()
+    *_, infos = [*roll(envs, 3)][-1]
+    assert final_numbers(infos, np.ones(2, bool))["score"].tolist() == [3, 3]
+
+
+class Strict(Small):
+    """An environment that takes no other actions than those of its space."""
+
+    def __init__(self, action_space):
+        super().__init__()
+        self.action_space = action_space
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        return super().step(action)
+
+
+@pytest.mark.parametrize("space", [
+    gym.spaces.Discrete(3, dtype=np.int32), gym.spaces.Discrete(3, dtype=np.int8, start=-1),
+    gym.spaces.MultiDiscrete([3, 2], dtype=np.int32), gym.spaces.MultiDiscrete([3, 2], dtype=np.uint8, start=[9, 0]),
+])  # fmt: skip
+def test_actions_have_the_type_of_their_space(space):
+    envs = make_envs(register(Strict, action_space=space), 2, seed=1)
+    envs.reset()
+    list(roll(envs, 10))
+
+
+def test_a_small_type_holds_its_values():
+    space = gym.spaces.MultiDiscrete([200, 3], dtype=np.uint8, start=[56, 0])
+    envs = make_envs(small(space=space, see=lambda env: np.array([255, 2], np.uint8)), 1, seed=1)
+    assert np.flatnonzero(envs.reset()[0]["observation"]).tolist() == [199, 202]
+
+
+SHAPES = [
+    (NUMBER, np.zeros(2, np.float32), r"observation is of float32, shape \(2,\), and its space float32, \(1,\)"),
+    (PICTURE, np.zeros((40, 48, 3)), r"observation is of float64, shape \(40, 48, 3\), and its space uint8"),
+    (gym.spaces.Dict({"a": gym.spaces.Tuple((NUMBER, NUMBER))}), {"a": (np.zeros(1),)}, r"observation\.a has no 1: "),
+    (gym.spaces.Dict({"a": NUMBER}), None, "observation has no 'a': None"),
+]
+
+
+@pytest.mark.parametrize(("space", "wrong", "message"), SHAPES, ids=[case[2] for case in SHAPES])
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_an_observation_of_another_shape(space, wrong, message, asynchronous):
+    see = lambda env: wrong if env.t == 2 else right  # noqa: E731
+    right = space.sample()
+    envs = make_envs(small(space=space, see=see), 2, seed=1, asynchronous=asynchronous)
+    envs.reset()
+    with pytest.raises(RuntimeError, match=r"environment \d raised ValueError in step 2 since .*: " + message):
+        list(roll(envs, 3))
+    envs.close()
+
+
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_a_reward_is_one_number(asynchronous):
+    envs = make_envs(small(earn=lambda env: np.array([0.25])), 2, seed=1, asynchronous=asynchronous)
+    envs.reset()
+    assert next(roll(envs, 1))[1].tolist() == [0.25, 0.25]
+    envs.close()
+    envs = make_envs(small(earn=lambda env: np.zeros(2)), 2, seed=1, asynchronous=asynchronous)
+    envs.reset()
+    with pytest.raises(RuntimeError, match=r"environment \d raised ValueError in step 1 .*: the reward is"):
+        list(roll(envs, 1))
+    envs.close()
+
+
+def test_a_process_that_dies():
+    envs = make_envs(small(earn=lambda env: os._exit(3) if env.t == 2 else 0.0), 2, seed=1, asynchronous=True)
+    envs.reset()
+    with pytest.raises(RunError, match=r"the process of environment \d ended, with exit code 3"):
+        list(roll(envs, 3))
+    envs.close()
+    assert not any(process.is_alive() for process in envs.unwrapped.processes)
+
+
+def test_processes_are_closed_while_a_call_is_pending(monkeypatch):
+    """As after a second Ctrl-C: the answers that were read already do not come again."""
+
+    def interrupted(envs, **_):
+        envs.parent_pipes[0].recv()
+        raise KeyboardInterrupt
+
+    envs = make_envs("CartPole-v1", 2, seed=1, asynchronous=True)
+    envs.reset()
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(AsyncVectorEnv, "step_wait", interrupted)
+        list(roll(envs, 1))
+    envs.close()
+    assert not any(process.is_alive() for process in envs.unwrapped.processes)
+
+
+class Unclosable(Small):
+    def close(self):
+        raise KeyError("no sim")
+
+
+@pytest.mark.parametrize("async_envs", [False, True])
+def test_an_environment_that_cannot_be_closed(tiny, async_envs, capfd):
+    folder = ppo_gru.main(tiny(env_id=register(Unclosable), async_envs=async_envs, num_envs=2))
+    assert capfd.readouterr().err.count("raised KeyError('no sim') when it was closed\n") >= 2
+    assert (folder / "checkpoint-128.pt").exists()
+
+
+def test_environments_are_closed_if_they_cannot_be_used():
+    closed = []
+
+    class Closes(Small):
+        def close(self):
+            closed.append(1)
+
+    with pytest.raises(ValueError, match="--frame-stack"):
+        make_envs(register(Closes), 2, frame_stack=-1)
+    assert closed == [1, 1]
+
+
+class ReadOnly(Together):
+    def _observations(self, values):
+        values = super()._observations(values)
+        values.flags.writeable = False
+        return values
+
+
+@pytest.mark.parametrize("wrapper", ["step_encoding", "observe_last_action", "frame_stack", "vector_frequencies"])
+def test_arrays_that_are_read_only(wrapper):
+    if "ReadOnly-v0" not in gym.registry:
+        gym.register("ReadOnly-v0", vector_entry_point=ReadOnly, kwargs={"as_objects": False, "nested": False})
+    envs = make_envs("ReadOnly-v0", 2, seed=1, **{wrapper: 1})
+    envs.reset()
+    assert sum(step[2].sum() for step in roll(envs, 5)) == 3
+
+
+def test_evaluations_are_in_one_process(tiny, opened):
+    run = opened(ppo_gru, tiny(env_id="CartPole-v1", async_envs=True, eval_interval=1, eval_levels=2))
+    assert len(run.envs.unwrapped.processes) == 4
+    assert not hasattr(run.eval_envs.unwrapped, "processes")
+
+
+def test_another_time_limit():
+    envs = make_envs("CartPole-v1", 1, seed=1, env_kwargs={"max_episode_steps": 3})
+    envs.reset()
+    assert [step[3].tolist() for step in roll(envs, 3)] == [[False], [False], [True]]
