@@ -622,9 +622,10 @@ def test_processes_are_closed_while_a_call_is_pending(monkeypatch):
 
     envs = make_envs("CartPole-v1", 2, seed=1, asynchronous=True)
     envs.reset()
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         patch.setattr(AsyncVectorEnv, "step_wait", interrupted)
-        list(roll(envs, 1))
+        with pytest.raises(KeyboardInterrupt):
+            list(roll(envs, 1))
     envs.close()
     assert not any(process.is_alive() for process in envs.unwrapped.processes)
 
