@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector.async_vector_env import AsyncState
 
 from memory_gym_envs.options import brief
 from ppo_utils.processes import RunError
@@ -112,8 +113,10 @@ class AsyncLanes(AsyncVectorEnv):
             return super().step(actions)
 
     def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
-        """End all processes, at once if a call has failed: its answers may never come."""
-        super().close_extras(timeout, terminate or self._pending)
+        """End all processes, at once if a call has failed."""
+        if self._pending:  # its answers may never come, and are not waited for
+            self._state, terminate = AsyncState.DEFAULT, True
+        super().close_extras(timeout, terminate)
 
     @contextlib.contextmanager
     def _alive(self) -> Iterator[None]:
