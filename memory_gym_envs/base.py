@@ -61,6 +61,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
     variants: ClassVar[Mapping[str, Any]] = {}
     tables: ClassVar[tuple[str, ...]] = ("_agent_tables",)  # attributes that place_tables() makes, too large to pickle
     growing: ClassVar[tuple[str, ...]] = ()  # arrays of `state` that are widened along their last axis when needed
+    truth_high: ClassVar[float] = 1.0  # the ground truth's largest value; the least is 0
     kept = ("ready", "settings", "_rngs", "_level_rngs", "_seeds")  # besides the arrays of `state`
 
     def __init__(

@@ -77,7 +77,7 @@ def walk_table(figure: Figure) -> np.ndarray:
     """(STRIDES * SPAN,) the next stored position for every stride and every stored position."""
     here = np.arange(SPAN) - PAD
     straight = figure.speed
-    diagonal = np.sqrt(0.5) * figure.speed
+    diagonal = 1 / math.sqrt(2) * figure.speed  # not sqrt(1/2), which differs in the last bit
     steps = np.array([0.0, -straight, straight, -diagonal, diagonal])  # STAND .. DIAGONAL_FORTH
     if figure.torus:
         # The original rounds the new position here, where it cuts the step off on bounded ground.

@@ -26,12 +26,20 @@ def disk(size: int, x: float, y: float, radius: int) -> np.ndarray:
 
 
 def ring(size: int, x: float, y: float, radius: int, width: int) -> np.ndarray:
-    """A circle of the given line width on a (size, size) mask."""
-    solid = disk(size, x, y, radius)
-    if width > 1:
-        return solid & ~disk(size, x, y, radius - width)
-    # A thin line is walked octant by octant: the outermost pixel of each column, and beside the diagonals of each row.
-    columns, rows = np.arange(size) + 0.5 - x, (np.arange(size) + 0.5 - y)[:, None]
+    """A circle of the given line width, less than the radius, on a (size, size) mask."""
+    if width == 1:
+        return _outline(disk(size, x, y, radius), x, y)
+    # The inner edge is a thin line of its own, within which nothing is drawn.
+    solid, inner = (_wider_disk(size, x, y, each) for each in (radius, radius - width + 1))
+    return solid & (~inner | _outline(inner, x, y))
+
+
+def _outline(solid: np.ndarray, x: float, y: float) -> np.ndarray:
+    """The edge of a disk, walked octant by octant.
+
+    Of each column it has the outermost pixel, and beside the diagonals of each row.
+    """
+    columns, rows = np.arange(len(solid)) + 0.5 - x, (np.arange(len(solid)) + 0.5 - y)[:, None]
     around = np.pad(solid, 1)
     above = np.where(rows < 0, around[:-2, 1:-1], around[2:, 1:-1])  # the next pixel away from the centre
     aside = np.where(columns < 0, around[1:-1, :-2], around[1:-1, 2:])
@@ -39,14 +47,24 @@ def ring(size: int, x: float, y: float, radius: int, width: int) -> np.ndarray:
     return solid & ((~above & (steep <= 0)) | (~aside & (steep >= 0)))
 
 
-def turned_45(mask: np.ndarray, size: int) -> np.ndarray:
-    """A square mask turned by 45 degrees counter-clockwise about its centre, on a (size, size) mask."""
-    old = len(mask)
+def _wider_disk(size: int, x: float, y: float, radius: int) -> np.ndarray:
+    """The disk that a thick circle fills up to its edge."""
+    solid = disk(size, x, y, radius)
+    # Its rasteriser walks row by row, one step beyond the diagonal: in two of all sizes that is a pixel too far.
+    row, column = {4: (2, 4), 11: (7, 9)}.get(radius, (0, 0))
+    down, across = (np.abs(np.arange(size) + 0.5 - middle) + 0.5 for middle in (y, x))  # >= 1
+    return solid | ((down == row)[:, None] & (across == column))
+
+
+def turned(mask: np.ndarray, degrees: float, size: int) -> np.ndarray:
+    """A square mask turned counter-clockwise about its centre, on a (size, size) mask."""
+    old, angle = len(mask), np.radians(degrees)
     offset = np.arange(size) + 0.5 - size / 2
-    x, y = offset[None, :], offset[:, None]
-    half = np.sqrt(0.5)
-    source_x = np.floor((x - y) * half + old / 2).astype(int)  # (size, size)
-    source_y = np.floor((x + y) * half + old / 2).astype(int)
+    # A hair to the left, because that is where the original's rounding turns.
+    x, y = offset[None, :] - 1e-3, offset[:, None]
+    cos, sin = np.cos(angle), np.sin(angle)
+    source_x = np.floor(x * cos - y * sin + old / 2).astype(int)  # (size, size)
+    source_y = np.floor(x * sin + y * cos + old / 2).astype(int)
     inside = (source_x >= 0) & (source_x < old) & (source_y >= 0) & (source_y < old)
     return inside & mask[source_y.clip(0, old - 1), source_x.clip(0, old - 1)]
 

@@ -34,7 +34,7 @@ from memory_gym_envs.character import (
     sprites,
     walk,
 )
-from memory_gym_envs.drawing import ROW, SCREEN, Sheet, paste, ring, turned_45
+from memory_gym_envs.drawing import ROW, SCREEN, Sheet, paste, ring, turned
 from memory_gym_envs.entries import Entries, vector_slices
 from memory_gym_envs.options import Option
 from memory_gym_envs.words import below, pick, words
@@ -324,12 +324,11 @@ def symbols() -> np.ndarray:
     arrow, circle = arrow_mask(), ring(22, 10, 10, 10, 2)
     circle[9:11, :20] = True
     # A turned arrow's square is larger. It keeps the top left corner, so it sits lower and further to the right.
-    oblique = turned_45(arrow, 31)
     masks = {"stay": circle}
     for quarter, (straight, slanted) in enumerate(
         [("right", "right_up"), ("up", "left_up"), ("left", "left_down"), ("down", "right_down")]
     ):
-        masks[straight], masks[slanted] = np.rot90(arrow, quarter), np.rot90(oblique, quarter)
+        masks[straight], masks[slanted] = np.rot90(arrow, quarter), turned(arrow, 45 + 90 * quarter, 31)
     table = np.zeros((1 + len(COMMANDS), SYMBOL, SYMBOL, 3), np.uint8)
     for command, name in enumerate(COMMANDS):
         mask = masks[name][:SYMBOL, :SYMBOL]

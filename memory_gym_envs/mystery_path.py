@@ -435,7 +435,7 @@ WHITE, GREY, ICE = (255, 255, 255), (210, 210, 210), (125, 177, 250)
 BLUE, GREEN, RED = (0, 0, 255), (0, 255, 0), (255, 0, 0)
 CROSS = 10  # width of the cross
 BAR = 4  # width of the stamina bar
-STEP, ORIGIN, GOAL, WALL = range(4)  # rows of tiles()
+STEP, ORIGIN, GOAL, WALL, EDGE = range(5)  # rows of tiles()
 BACK = np.arange(1, (2 * SIDE - 1) * SIDE + 1)  # steps back that can be drawn: those on less than two segments
 
 
@@ -451,7 +451,7 @@ def tile_picture(inner: tuple[int, int, int], border: tuple[int, int, int]) -> n
 @cache
 def tiles() -> Sheet:
     """Every kind of tile, to be pasted where a part of it may be off the screen."""
-    colors = [(WHITE, GREY), (BLUE, BLUE), (GREEN, GREEN), (RED, RED)]
+    colors = [(WHITE, GREY), (BLUE, BLUE), (GREEN, GREEN), (RED, RED), (GREY, GREY)]
     pictures = np.stack([tile_picture(*color) for color in colors])
     return make_sheet(pictures, np.ones(pictures.shape[:3], bool), np.arange(SPAN) - PAD)
 
@@ -533,6 +533,12 @@ def ground_rows(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     return (walked % s.ground_period[lanes] + 1) * s.show_ground[lanes]
 
 
+# The picture of a past tile by its first pixel, counted from the end if negative. Where just two of its columns are on
+# the screen, the original paints both like its border.
+TRAIL_KIND = np.full(SCREEN + TILE, STEP)
+TRAIL_KIND[[2 - TILE, SCREEN - 2]] = EDGE
+
+
 def draw_trail(frames: np.ndarray, s: State, lanes: np.ndarray | slice) -> None:
     """Draws the past path on the lanes' frames, in place."""
     owner, x, y = trail_on_screen(s, lanes)
@@ -541,7 +547,7 @@ def draw_trail(frames: np.ndarray, s: State, lanes: np.ndarray | slice) -> None:
         cut = ~whole & (x > -TILE) & (x < SCREEN)
         centres = np.stack([x[cut], y[cut]], axis=1) + TILE // 2 + PAD
         # Before the whole tiles, which then cover what the cut ones' squares have of them.
-        paste(frames, tiles(), np.full(len(centres), STEP), centres, owner[cut])
+        paste(frames, tiles(), TRAIL_KIND.take(x[cut]), centres, owner[cut])
         owner, x, y = owner[whole], x[whole], y[whole]
     stamp(frames, tile_picture(WHITE, GREY), owner, x, y)
 
@@ -652,8 +658,8 @@ def write_trail(out: np.ndarray, s: State, lanes: np.ndarray | slice, tables: Ap
     owner, x, y = trail_on_screen(s, lanes)
     inset, width = 0, SCREEN
     if np.count_nonzero(s.extras[lanes]):
-        # The background has the same corners, but not the pixels inside them.
-        inset, width = s.show_ground[lanes][owner], (SCREEN - BAR * s.show_stamina[lanes])[owner]  # (m,)
+        # The background has the same borders, which may be two columns wide, but not the pixels inside them.
+        inset, width = 2 * s.show_ground[lanes][owner], (SCREEN - BAR * s.show_stamina[lanes])[owner]  # (m,)
     shown = (x + inset < width) & (x + (TILE - 1) - inset >= 0)
     cut = x == 1 - TILE  # all but its last pixels, in the screen's first column
     if np.count_nonzero(cut):

@@ -57,7 +57,6 @@ MARGIN = 7  # coins and the exit stay that far from the screen's edges
 AGENT_SPACE, COIN_SPACE = 28, 21  # pixels around a place where nothing else is put
 SPOT_RADII = (1, 42)  # pixels; the largest light is as wide as the screen
 MOST_COINS = 20
-MOST_SPOTS = 200  # slow spotlights stay for ever, so others may come ever faster than they leave
 
 AGENT, EXIT, COIN = 0, 1, 2  # bodies; coins are the last ones
 GONE = 180  # where bodies are that do not exist, in pixels: too far away to be touched or seen
@@ -408,7 +407,8 @@ def add_spot(s: State, lane: int, spot: list[float]) -> None:
     """Adds a spotlight to the lane's."""
     at = int(s.num_spots[lane])
     if at == s.spot_key.shape[1]:
-        make_room(s, spots=at + 2)
+        # Every step reads all of that, so it is just enough, unless there are so many that growing often costs more.
+        make_room(s, spots=at + max(2, at // 8))
     s.spots[:, lane, at] = spot
     s.spot_key[lane, at] = spot[RADIUS] * PLACES + PLACE_0
     s.num_spots[lane] = at + 1
@@ -519,7 +519,9 @@ def _draw_coin_sprite(image: np.ndarray, solid: np.ndarray, scale: float) -> Non
     solid |= disk(len(solid), middle, middle, radius)
     image[solid] = YELLOW
     # A line of no width fills the circle: small coins are orange all over.
-    image[ring(len(solid), middle, middle, radius, rim) if rim else solid] = ORANGE
+    edge = ring(len(solid), middle, middle, radius, rim) if rim else solid
+    image[edge] = ORANGE
+    solid |= edge
 
 
 def _draw_exit_sprite(image: np.ndarray, solid: np.ndarray, scale: float, color: tuple[int, int, int]) -> None:
@@ -960,7 +962,9 @@ def take_damage(s: State, lanes: np.ndarray) -> np.ndarray:
     s.health[lanes] -= s.damage[lanes]
     s.floor[lanes] += 1
     lost = 1 - s.health[lanes] / s.full_health[lanes]
-    s.lost_width[lanes] = np.minimum(SCREEN // 2 * lost, SCREEN)  # cut off to whole pixels
+    # Cut off to whole pixels, and to the last 32 bits, as in the original, which draws nothing if those are negative.
+    width = (SCREEN // 2 * lost).astype(np.int64).astype(np.int32)
+    s.lost_width[lanes] = np.maximum(s.lost_width[lanes], np.minimum(width, SCREEN))
     return s.health[lanes] <= 0
 
 
@@ -1020,14 +1024,14 @@ class SearingSpotlights(MemoryGymVectorEnv):
     bar or below it, depending on what else is.
     Differences from the original: images are rows first; max_steps truncates; the finite id reports ground truth;
         nothing that an episode drew or painted black or white shows in the next; no exit, no coins and a hidden action
-        bar work; coins for which no free pixel is left are put anywhere; a smallest radius or speed above the largest
-        replaces it; at most MOST_SPOTS spotlights shine at once, and no further one comes until one is gone;
-        `coin_enabled` is new; wrong options raise ValueError.
+        bar work; the share of no coins is 1, not NaN; coins for which no free pixel is left are put anywhere; a
+        smallest radius or speed above the largest replaces it; `coin_enabled` is new; wrong options raise ValueError.
     """
 
     variants = VARIANTS
     tables = ("_agent_tables", "_drawing", "_vector_tables")
     growing = ("bodies", "touch_squared", "spots", "spot_key", "spot_place")
+    truth_high = (SCREEN + 2) / SCREEN  # an agent may start that far outside of the screen
     kept = (*MemoryGymVectorEnv.kept, "_unlocked")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
@@ -1177,10 +1181,9 @@ class SearingSpotlights(MemoryGymVectorEnv):
         np.subtract(s.pos.T, PAD, out=s.bodies[:, :, AGENT])
 
     def _spawn(self, lane: int) -> None:
-        """Adds a spotlight to the lane's, if there is room."""
+        """Adds a spotlight to the lane's."""
         s = self.state
-        if s.num_spots[lane] < MOST_SPOTS:
-            add_spot(s, lane, sample_spot(self._rngs[lane], self.settings[lane]))
+        add_spot(s, lane, sample_spot(self._rngs[lane], self.settings[lane]))
         s.spawns_left[lane] -= 1
         # Always the first interval of the original's list, as its spawns remove the last one.
         s.spawn_wait[lane] = s.spawn_interval[lane] if s.spawns_left[lane] else NO_LIMIT

@@ -19,6 +19,7 @@ class MemoryGymEnv(gym.Env):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 25}
+    has_ground_truth_info = True  # every info has it
 
     def __init__(self, variant: str, render_mode: str | None = None, **arguments: Any):
         self.batch = gym.make_vec(
@@ -77,6 +78,23 @@ class MemoryGymEnv(gym.Env):
     def close(self) -> None:
         """Releases nothing: no environment holds a window or shares anything with another."""
         self.batch.close()
+
+    # What else the original's environments have.
+
+    @property
+    def ground_truth_space(self) -> gym.spaces.Box:
+        """The space of the infos' ground truth."""
+        return gym.spaces.Box(0.0, self.batch.truth_high, self.batch.ground_truth()[0].shape, np.float64)
+
+    @property
+    def default_reset_parameters(self) -> dict[str, Any]:
+        """The reset options of an episode that is started without any."""
+        return dict(self.batch.defaults)
+
+    @property
+    def reset_params(self) -> dict[str, Any]:
+        """The reset options of this episode, those that were not given included."""
+        return dict(self.batch.settings[0])
 
     # Gymnasium keeps an environment's generator in these two names; here they are lane 0's.
 

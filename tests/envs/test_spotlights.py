@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from players import player
 
-from memory_gym_envs.searing_spotlights import AGENT, COIN, EXIT, GONE, MOST_SPOTS, RADIUS, REACH, SIGHT, SPEED, TIME
+from memory_gym_envs.searing_spotlights import AGENT, COIN, EXIT, GONE, RADIUS, REACH, SIGHT, SPEED, TIME
 
 FINITE, ENDLESS = "SearingSpotlights-v0", "Endless-SearingSpotlights-v0"
 SAFE = {"spot_damage": 0}
@@ -276,18 +276,16 @@ def test_num_spawns_runs_out():
 
 
 @pytest.mark.parametrize("env_id", [FINITE, ENDLESS])
-def test_spotlights_that_never_leave_do_not_pile_up(env_id):
+def test_spotlights_that_never_leave_pile_up(env_id):
     env, _ = make(env_id)
     fast = {"spawn_interval": 1} if env_id == ENDLESS else {"initial_spawn_interval": 0, "spawn_interval_threshold": 0}
     never = {"max_steps": -1, "steps_per_coin": -1} if env_id == ENDLESS else {"max_steps": -1, "num_spawns": 10**9}
     env.reset(seed=0, options={**SAFE, **fast, **never, "spot_min_speed": 0.0, "spot_max_speed": 0.0})
-    counts = [(env.step([0, 0]), int(env.batch.state.num_spots[0]))[1] for _ in range(MOST_SPOTS + 10)]
-    assert counts[:3] == [counts[0], counts[0] + 1, counts[0] + 2]
-    assert counts[-11:] == [MOST_SPOTS] * 11
-    assert env.batch.state.spots.shape[2] <= MOST_SPOTS + 2
-    env.batch.state.spots[TIME, 0, 5] = 1.0  # one leaves, and the next one comes
-    counts = [(env.step([0, 0]), int(env.batch.state.num_spots[0]))[1] for _ in range(3)]
-    assert counts == [MOST_SPOTS - 1, MOST_SPOTS, MOST_SPOTS]
+    s = env.batch.state
+    first = int(s.num_spots[0])
+    counts = [(env.step([0, 0]), int(s.num_spots[0]))[1] for _ in range(500)]
+    assert counts == [first + 1 + step for step in range(500)]
+    assert s.spots.shape[2] < 600  # there is no room for many more, as every step reads all of it
 
 
 def test_spotlight_behind_a_removed_one_pauses():

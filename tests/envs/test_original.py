@@ -1,0 +1,125 @@
+"""What memory-gym 1.0.2 does where no recording leads. The expected values are what it gave."""
+
+import copy
+import math
+import zlib
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from helpers import EACH, check_same, roll
+
+import fuzz_original
+from memory_gym_envs import IDS
+from memory_gym_envs.character import DIAGONAL_FORTH, PAD, SPAN, STRIDES, Figure, sprites, walk_table
+from memory_gym_envs.options import resolve
+from memory_gym_envs.searing_spotlights import draw_coins_and_exits
+
+CROWD = {"spawn_interval": 1, "spot_min_speed": 1e-5, "spot_max_speed": 1e-4, "spot_damage": 0.0, "steps_per_coin": -1}
+
+
+def test_diagonal_strides():
+    """At speeds of whole pixels times the root of two, which the last bit decides."""
+    strides = [1, 2, 2, 4, 5, 5, 6, 8, 8, 10, 10, 11, 12, 13, 15, 16, 16, 17, 19, 20, 20, 21, 22, 23, 25, 25, 27, 27]
+    for pixels, stride in enumerate(strides, 1):
+        figure = Figure(0.25, math.sqrt(2 * pixels**2), 0, 84, 6, False)
+        assert walk_table(figure).reshape(STRIDES, SPAN)[DIAGONAL_FORTH, PAD + 20] == PAD + 20 + stride
+
+
+def on_grey(image: np.ndarray, solid: np.ndarray) -> bytes:
+    """A sprite in the middle of a grey frame."""
+    wide = np.full((200, 200, 3), 9, np.uint8)
+    first = 100 - len(solid) // 2
+    wide[first : first + len(solid), first : first + len(solid)][solid] = image[solid]
+    return wide[58:142, 58:142].tobytes()
+
+
+def checksum(pictures) -> int:
+    total = 0
+    for each in pictures:
+        total = zlib.crc32(on_grey(*each), total)
+    return total
+
+
+def test_sprites_of_every_size():
+    agents = (pair for scale in range(40, 1001, 5) for pair in zip(*sprites(scale / 1000), strict=True))
+    assert checksum(agents) == 3011986934
+    every = [draw_coins_and_exits(((scale / 100, scale / 100),)) for scale in range(10, 201)]
+    assert checksum((images[0], solids[0]) for images, solids in every) == 1025842134
+    assert checksum((images[i], solids[i]) for images, solids in every for i in (1, 2)) == 3620741150
+
+
+def test_two_columns_of_a_past_tile_are_grey():
+    env = gym.make("Endless-MysteryPath-v0")
+    env.reset(seed=1103668575, options={"agent_speed": 7})
+    for action in (1, 2, 2, 1, 1, 2, 2, 2, 1, 1, 1, 1, 1, 2, 2, 1, 1):
+        frame = env.step(action)[0]
+    assert frame[77, :4].tolist() == [[210] * 3] * 3 + [[255] * 3]
+
+
+def test_any_number_of_spotlights():
+    env, rng, total = gym.make("Endless-SearingSpotlights-v0"), np.random.default_rng(0), 0
+    env.reset(seed=1000001, options=CROWD)
+    for _ in range(301):
+        total = zlib.crc32(env.step(rng.integers(0, 3, 2))[0].tobytes(), total)
+    assert env.unwrapped.batch.state.num_spots[0] == 304
+    assert total == 3712758107
+
+
+def test_a_crowd_of_spotlights_is_saved():
+    envs, twin = (gym.make_vec("Endless-SearingSpotlights-v0", num_envs=4) for _ in range(2))
+    envs.reset(seed=0, options=CROWD)
+    roll(envs, 250)
+    twin.set_state(envs.get_state())
+    check_same(roll(envs, 20, seed=1), roll(twin, 20, seed=1))
+
+
+def test_health_far_below_zero():
+    """The bar's red part is as wide as the last 32 bits of its width say, if that is positive."""
+    for damage, red in ((1e3, 42), (6e7, 0), (1e8, 0), (1.1e8, 42)):
+        env = gym.make("SearingSpotlights-v0")
+        env.reset(seed=0, options={"agent_health": 1, "spot_damage": damage, "initial_spawns": 100})
+        over = False
+        while not over:
+            frame, _, over, _, _ = env.step([0, 0])
+        assert (frame[0, :42] == (255, 0, 0)).all(axis=-1).sum() == red
+
+
+@EACH
+def test_attributes_of_the_original(env_id):
+    env = gym.make(env_id).unwrapped
+    space = env.ground_truth_space
+    assert env.has_ground_truth_info
+    assert env.default_reset_parameters["agent_scale"] == 0.25
+    for seed in range(20):
+        _, info = env.reset(seed=seed, options={"agent_scale": 0.3})
+        assert info["ground_truth"] in space
+        assert env.step(env.action_space.sample())[4]["ground_truth"] in space
+    assert env.reset_params == env.default_reset_parameters | {"agent_scale": 0.3}
+    env.default_reset_parameters["agent_scale"] = env.reset_params["agent_scale"] = 1.0
+    assert (env.default_reset_parameters["agent_scale"], env.reset_params["agent_scale"]) == (0.25, 0.3)
+
+
+# ---- benchmarks/fuzz_original.py ----
+
+
+@EACH
+def test_fuzz_draws_valid_options(env_id):
+    table = gym.make(env_id).unwrapped.batch.variant.options
+    for seed in range(100):
+        resolve(table, fuzz_original.draw_options(np.random.default_rng(seed), table), env_id)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_fuzz_finds_what_differs(env_id):
+    """An episode is compared with itself, and then with a copy in which one thing is different."""
+    env = gym.make(env_id).unwrapped
+    ours = fuzz_original.play(env, 0, {}, fuzz_original.choose_actions(np.random.default_rng(0), env), theirs=False)
+    theirs = copy.deepcopy(ours)
+    assert fuzz_original.compare(ours, theirs, 1.0) == {}
+    theirs["seen"][3][2] += 1
+    theirs["seen"][4][0] = [value + 1e-3 for value in theirs["seen"][4][0]]
+    theirs["rewards"][1] += 0.1
+    theirs["over"] = not theirs["over"]
+    found = fuzz_original.compare(ours, theirs, 1.0)
+    assert found == {"frame": 3, "ground truth": 4, "reward": 2, "end": len(ours["rewards"])}
