@@ -134,6 +134,10 @@ class Args:
     """largest norm of the gradient, which is scaled down to it"""
     target_kl: PositiveFloat | None = None
     """stop the update at a minibatch on which the approximate KL divergence from the old policy is larger"""
+    optimizer: Literal["adamw", "muon"] = "adamw"
+    """muon: Muon for the matrices between hidden layers, AdamW for all other weights"""
+    muon_lr_ratio: PositiveFloat = 3.0
+    """learning rate of Muon, in multiples of AdamW's, which --init-lr and --final-lr are"""
     init_lr: UnitInterval = 2.75e-4
     """initial learning rate"""
     final_lr: UnitInterval = 1.0e-5
@@ -223,13 +227,14 @@ def train(args: Args, run: Run) -> None:
         run.iteration = global_step // batch_size + 1
         lr = anneal(global_step, args.init_lr, args.final_lr, args.anneal_steps)
         ent_coef = anneal(global_step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
-        run.optimizer.param_groups[0]["lr"] = lr
+        for optimizer, ratio in zip(run.optimizers, (1.0, args.muon_lr_ratio), strict=False):
+            optimizer.param_groups[0]["lr"] = lr * ratio
 
         last_value, episodes = collect(agent, run.envs, rollout, args)
         collected = time.perf_counter()
         rollout.advantages = gae(rollout, last_value, args.gamma, args.gae_lambda)
         rollout.returns = rollout.advantages + rollout.values
-        logs = mean_logs(update(agent, run.optimizer, rollout, ent_coef, args), rollout)
+        logs = mean_logs(update(agent, run.optimizers, rollout, ent_coef, args), rollout)
         updated = time.perf_counter()
 
         logs |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
@@ -338,7 +343,7 @@ def collect(
 
 
 def update(
-    agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, ent_coef: float, args: Args
+    agent: Agent, optimizers: list[torch.optim.Optimizer], rollout: Rollout, ent_coef: float, args: Args
 ) -> list[dict[str, Tensor]]:
     """Learn from the rollout for some epochs; return what to log of each gradient step."""
     if args.norm_adv == "batch":
@@ -355,11 +360,12 @@ def update(
                 kl = np.mean(all_gather(logs["approx_kl"].item()))  # all processes stop together
                 if kl > args.target_kl:
                     return step_logs
-            optimizer.zero_grad()
+            agent.zero_grad()
             loss.backward()
             average_gradients(agent, int(minibatch.length.sum()))  # over processes, if there are several
             logs["grad_norm"] = clip_gradients(agent, args)
-            optimizer.step()
+            for optimizer in optimizers:
+                optimizer.step()
             step_logs.append(logs)
     return step_logs
 
@@ -866,6 +872,23 @@ class Agent(nn.Module):
         return policy, log_probs_of(policy, actions), values, features
 
 
+def make_optimizers(agent: Agent, args: Args) -> list[torch.optim.Optimizer]:
+    """Return AdamW, and with --optimizer muon also Muon (Jordan et al., 2024) for the matrices between hidden layers.
+
+    Its steps are orthogonal: all directions of a matrix change alike. Outer layers, whose other side is an observation
+    or an output, are AdamW's, as is all that is no matrix of one `nn.Linear`: recurrent layers stack those of gates.
+    """
+    outer = ("encoder.mlp.", "heads.policy.2.", "heads.value.2.", "decoder.", "estimator.")
+    linear = {layer.weight for layer in agent.modules() if isinstance(layer, nn.Linear)}
+    named = agent.named_parameters() if args.optimizer == "muon" else []
+    hidden = [weight for name, weight in named if weight in linear and not name.startswith(outer)]
+    others = [weight for weight in agent.parameters() if weight not in {*hidden}]
+    optimizers = [torch.optim.AdamW(others, lr=args.init_lr, fused=True)]
+    if hidden:
+        optimizers.append(torch.optim.Muon(hidden, weight_decay=0.01, adjust_lr_fn="match_rms_adamw"))
+    return optimizers
+
+
 def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
     """Return the log-probability (B, A) of the chosen action (B, A) of every branch."""
     return torch.stack([branch.log_prob(action) for branch, action in zip(policy, actions.unbind(-1), strict=True)], -1)
@@ -885,8 +908,7 @@ def setup(args: Args) -> Run:
         obs, infos = envs.reset()
         agent = make_agent(Agent, envs, infos, args).to(device)
         rollout = Rollout.allocate(args.num_steps, obs, ground_truth_of(infos, args), agent)
-    optimizer = torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)
-    run = Run(script=script, envs=envs, agent=agent, optimizer=optimizer, rollout=rollout)
+    run = Run(script=script, envs=envs, agent=agent, optimizers=make_optimizers(agent, args), rollout=rollout)
     return open_run(args, run, checkpoint)  # sets all of it to the checkpoint's state, if there is one
 
 

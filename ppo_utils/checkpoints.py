@@ -58,7 +58,7 @@ def save_checkpoint(args: Any, run: Run) -> None:
         with path.open("rb") as file:
             os.fsync(file.fileno())
     saved = {"seconds": run.seconds, "returns": list(run.returns), "lengths": list(run.lengths)}
-    saved["optimizer"] = run.optimizer.state_dict()
+    saved["optimizers"] = [optimizer.state_dict() for optimizer in run.optimizers]
     saved["processes"] = map_nested(processes, np.ndarray, torch.from_numpy)  # weights_only loads no arrays
     write_file(model_of(args, run) | saved, run.folder / f"checkpoint-{run.step}.pt")
     for path in checkpoints_in(run.folder)[:-CHECKPOINTS_KEPT]:
@@ -250,14 +250,16 @@ def load_model(args: Any, agent: nn.Module, script: str) -> None:
 
 
 def load_learner(run: Run, saved: dict[str, Any], folder: str | Path) -> None:
-    """Set the agent, the optimizer and what is counted to what a folder's checkpoint holds.
+    """Set the agent, the optimizers and what is counted to what a folder's checkpoint holds.
 
-    Raises ValueError if weights or optimizer do not fit, or if the checkpoint is of an older version.
+    Raises ValueError if weights or optimizers do not fit, or if the checkpoint is of an older version.
     """
     load_weights(run.agent, saved, folder)
-    run.optimizer.load_state_dict(saved["optimizer"])
-    moments = [(weight, each["exp_avg"]) for weight, each in run.optimizer.state.items()]
-    same_order = all(weight.shape == moment.shape for weight, moment in moments)  # torch goes by their order alone
+    same_order = True  # of the weights, by which alone torch goes
+    for optimizer, state in zip(run.optimizers, saved.get("optimizers", [saved.get("optimizer")]), strict=True):
+        optimizer.load_state_dict(state)
+        for weight, moments in optimizer.state.items():
+            same_order &= all(moment.shape in (weight.shape, ()) for moment in moments.values())
     memory = saved["processes"][rank_and_size()[0]]["memory"]
     if not same_order or run.rollout.initial_memory.keys() - memory.keys():
         raise ValueError(

@@ -68,7 +68,7 @@ class Run:
     script: str  # the name of the script
     envs: gym.vector.VectorEnv
     agent: nn.Module
-    optimizer: torch.optim.Optimizer
+    optimizers: list[torch.optim.Optimizer]
     rollout: Any  # a script's Rollout
     folder: Path = Path()  # named by `open_run`
     eval_envs: gym.vector.VectorEnv | None = None

@@ -603,7 +603,7 @@ def test_several_files_of_a_run(agents, monkeypatch, capsys):
 
     def read(path):
         run, step = files[path]
-        return read_model(f"{agents[run]}/model.pt") | {"step": step, "optimizer": {}}
+        return read_model(f"{agents[run]}/model.pt") | {"step": step, "optimizers": []}
 
     monkeypatch.setattr(evaluate, "read_model", read)
     config = evaluate.Config(tuple(files), max_steps=3, json="scores.json", **FEW)

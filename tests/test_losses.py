@@ -120,7 +120,7 @@ def test_a_gradient_step_is_no_longer_than_its_norm_allows(played, max_grad_norm
     rollout, agent = run.rollout, run.agent
     rollout.returns = rollout.values + 100
     before = {name: weight.clone() for name, weight in agent.state_dict().items()}
-    (logs,) = ppo_gru.update(agent, torch.optim.SGD(agent.parameters(), lr=1.0), rollout, 0.0, args)
+    (logs,) = ppo_gru.update(agent, [torch.optim.SGD(agent.parameters(), lr=1.0)], rollout, 0.0, args)
     steps = {name: (weight - before[name]).flatten() for name, weight in agent.state_dict().items()}
     for of_probe in (False, True):
         step = torch.cat([step for name, step in steps.items() if name.startswith("estimator") == of_probe]).norm()
@@ -167,14 +167,14 @@ def test_advantages_are_normalized_by_minibatch_or_by_rollout(played, monkeypatc
         return surrogate(log_ratio, advantages, clip_coef)
 
     monkeypatch.setattr(ppo_gru, "policy_loss", spy)
-    ppo_gru.update(run.agent, run.optimizer, rollout, 0.0, args)
+    ppo_gru.update(run.agent, run.optimizers, rollout, 0.0, args)
     torch.testing.assert_close(rollout.advantages, (advantages - advantages.mean()) / advantages.std(correction=0))
     assert rollout.returns is returns
     whole = torch.cat(seen[: args.num_minibatches]).sort().values
     torch.testing.assert_close(whole, rollout.advantages.flatten().sort().values)
 
     seen.clear()
-    ppo_gru.update(run.agent, run.optimizer, rollout, 0.0, dataclasses.replace(args, norm_adv="minibatch"))
+    ppo_gru.update(run.agent, run.optimizers, rollout, 0.0, dataclasses.replace(args, norm_adv="minibatch"))
     assert len(seen) > 1
     for each in seen:
         assert each.mean().item() == pytest.approx(0.0, abs=1e-5)

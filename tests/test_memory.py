@@ -206,7 +206,7 @@ def test_the_encoder_sees_each_step_once_an_epoch_and_no_padding(played, monkeyp
     run.agent.encoder.register_forward_pre_hook(lambda _, inputs: rows.append(len(inputs[0]["observation"])))
     unroll = ppo_gru.packed_gru if packed else padded_gru
     monkeypatch.setattr(ppo_gru, "packed_gru", lambda *given: (runs.append(1), unroll(*given))[1])
-    ppo_gru.update(run.agent, run.optimizer, run.rollout, 0.0, args)
+    ppo_gru.update(run.agent, run.optimizers, run.rollout, 0.0, args)
     assert sum(rows) == args.update_epochs * args.num_envs * args.num_steps
     assert len(runs) == args.update_epochs * args.num_minibatches, "all pieces of a minibatch at once"
     rows.clear()

@@ -79,10 +79,43 @@ def test_defaults_are_the_final_column_of_table_6_1():
 def test_the_optimizer(tiny, opened, script):
     """AdamW with torch's default decay for all weights, at the first learning rate."""
     run = opened(script, tiny(script, env_id="CueRecall-v0", init_lr=0.125))
-    (group,) = run.optimizer.param_groups
-    assert isinstance(run.optimizer, torch.optim.AdamW)
+    (optimizer,) = run.optimizers
+    (group,) = optimizer.param_groups
+    assert isinstance(optimizer, torch.optim.AdamW)
     assert {*group["params"]} == {*run.agent.parameters()}
     assert (group["weight_decay"], float(group["lr"]), group["betas"]) == (0.01, 0.125, (0.9, 0.999))
+
+
+@pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
+def test_muon_has_the_matrices_between_hidden_layers(tiny, opened, script):
+    changes = {"env_id": "MortarMayhemB-Grid-v0", "reconstruction_coef": 0.1, "ground_truth_coef": 0.1}
+    changes |= {"trxl_gate": "gru", "trxl_positional_encoding": "learned"} if script is ppo_trxl else {}
+    run = opened(script, tiny(script, optimizer="muon", **changes))
+    adamw, muon = run.optimizers
+    assert (type(adamw), type(muon)) == (torch.optim.AdamW, torch.optim.Muon)
+    names = {weight: name for name, weight in run.agent.named_parameters()}
+    (theirs,), (group,) = adamw.param_groups, muon.param_groups
+    assert len(theirs["params"]) + len(group["params"]) == len(names)
+    assert {*theirs["params"], *group["params"]} == {*names}
+    common = {"encoder.embedding.weight", "heads.trunk.weight", "heads.policy.0.weight", "heads.value.0.weight"}
+    blocks = [f"memory.blocks.{k}." for k in range(2)] if script is ppo_trxl else []
+    inside = [f"attention.{each}" for each in ("query", "key", "value", "output")] + ["projection"]
+    inside += [
+        f"{gate}.{each}" for gate in ("merge_attention", "merge_output") for each in ("from_y", "from_x", "candidate")
+    ]
+    assert {names[weight] for weight in group["params"]} == common | {f"{b}{i}.weight" for b in blocks for i in inside}
+    assert (group["weight_decay"], group["momentum"], group["adjust_lr_fn"]) == (0.01, 0.95, "match_rms_adamw")
+
+
+def test_muon_s_learning_rate(tiny, monkeypatch):
+    """In multiples of AdamW's, all along its decay."""
+    seen, step = [], torch.optim.Muon.step
+    monkeypatch.setattr(torch.optim.Muon, "step", lambda muon: (seen.append(muon.param_groups[0]["lr"]), step(muon)))
+    args = tiny(
+        env_id="CueRecall-v0", optimizer="muon", muon_lr_ratio=5.0, init_lr=0.01, final_lr=0.0, anneal_steps=128
+    )
+    ppo_gru.main(args)
+    assert seen == [0.05] * 4 + [0.025] * 4
 
 
 @pytest.mark.parametrize("memory", ["gru", "lstm"])

@@ -44,7 +44,7 @@ for name, args, weights, rollout in torch.load("given.pt", weights_only=False):
     for name in ("stored",) if script.__name__ == "ppo_gru" else ("hidden", "row_step"):
         setattr(run.rollout.memory_state, name, getattr(rollout["memory_state"], name)[:, lanes])
     optimizer = torch.optim.SGD(run.agent.parameters(), lr=1.0)
-    logs = script.mean_logs(script.update(run.agent, optimizer, run.rollout, 0.01, args), run.rollout)
+    logs = script.mean_logs(script.update(run.agent, [optimizer], run.rollout, 0.01, args), run.rollout)
     updated.append((run.agent.state_dict(), logs))
 torch.save(updated, f"updated{rank}.pt")
 close(run)
@@ -84,7 +84,7 @@ def test_two_processes_make_the_update_of_one(tiny, opened):
         run = opened(script, args)
         given.append(rollout_to_learn_from(script, args, run))
         optimizer = torch.optim.SGD(run.agent.parameters(), lr=1.0)
-        logs = script.mean_logs(script.update(run.agent, optimizer, run.rollout, 0.01, args), run.rollout)
+        logs = script.mean_logs(script.update(run.agent, [optimizer], run.rollout, 0.01, args), run.rollout)
         alone.append((run.agent.state_dict(), logs))
     torch.save(given, "given.pt")
 

@@ -63,6 +63,8 @@ RUNS = {
         "script": ppo_trxl, "env_id": "MortarMayhem-Grid-v0", "trxl_gate": "gru", "eval_interval": 1, "eval_levels": 1,
         "eval_max_steps": 30,
     },
+    "GRU, Muon": {**GRID, "optimizer": "muon"},
+    "GTrXL, Muon": {"script": ppo_trxl, **ENDLESS, "trxl_gate": "gru", "optimizer": "muon"},
     "TrXL, both heads": {
         "script": ppo_trxl, "env_id": "SearingSpotlights-v0", "ground_truth_coef": 0.1, "reconstruction_coef": 0.1,
         "reconstruction_detach": True,
@@ -385,8 +387,9 @@ def test_a_folder_that_cannot_be_written(trained, monkeypatch):
 def test_a_checkpoint_with_the_weights_in_another_order(trained):
     path = trained / "checkpoint-128.pt"
     saved = read_model(path)
-    moments = saved["optimizer"]["state"]
-    saved["optimizer"]["state"] = {i: moments[(i + 1) % len(moments)] for i in moments}
+    (optimizer,) = saved["optimizers"]
+    moments = optimizer["state"]
+    optimizer["state"] = {i: moments[(i + 1) % len(moments)] for i in moments}
     torch.save(saved, path)
     with pytest.raises(ValueError, match=r"is of an older version, .*; --load-model takes its weights"):
         resumed(ppo_gru, trained, "--total-timesteps", "256")

@@ -295,7 +295,7 @@ def update_with(played, monkeypatch, target_kl):
     with monkeypatch.context() as patch:
         patch.setattr(ppo_gru, "ppo_loss", recorded)
         optimizer = torch.optim.SGD(run.agent.parameters(), lr=0.1)
-        return divergences, len(ppo_gru.update(run.agent, optimizer, run.rollout, 0.0, args))
+        return divergences, len(ppo_gru.update(run.agent, [optimizer], run.rollout, 0.0, args))
 
 
 def test_target_kl_ends_the_update_at_the_first_minibatch_beyond_it(played, monkeypatch):
