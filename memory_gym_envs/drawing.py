@@ -27,11 +27,12 @@ def disk(size: int, x: float, y: float, radius: int) -> np.ndarray:
 
 def ring(size: int, x: float, y: float, radius: int, width: int) -> np.ndarray:
     """A circle of the given line width, less than the radius, on a (size, size) mask."""
+    size, x, y = size + 2, x + 1, y + 1  # a pixel more on each side: where the mask ends is no edge
     if width == 1:
-        return _outline(disk(size, x, y, radius), x, y)
+        return _outline(disk(size, x, y, radius), x, y)[1:-1, 1:-1]
     # The inner edge is a thin line of its own, within which nothing is drawn.
     solid, inner = (_wider_disk(size, x, y, each) for each in (radius, radius - width + 1))
-    return solid & (~inner | _outline(inner, x, y))
+    return (solid & (~inner | _outline(inner, x, y)))[1:-1, 1:-1]
 
 
 def _outline(solid: np.ndarray, x: float, y: float) -> np.ndarray:

@@ -12,6 +12,7 @@ from helpers import EACH, check_same, roll
 import fuzz_original
 from memory_gym_envs import IDS
 from memory_gym_envs.character import DIAGONAL_FORTH, PAD, SPAN, STRIDES, Figure, sprites, walk_table
+from memory_gym_envs.drawing import ring
 from memory_gym_envs.options import resolve
 from memory_gym_envs.searing_spotlights import draw_coins_and_exits
 
@@ -123,3 +124,8 @@ def test_fuzz_finds_what_differs(env_id):
     theirs["over"] = not theirs["over"]
     found = fuzz_original.compare(ours, theirs, 1.0)
     assert found == {"frame": 3, "ground truth": 4, "reward": 2, "end": len(ours["rewards"])}
+
+
+@pytest.mark.parametrize("width", [1, 4])
+def test_a_circle_that_is_cut_off_has_no_edge_there(width):
+    assert np.array_equal(ring(40, 38, 3, 10, width), ring(60, 38, 3, 10, width)[:40, :40])
