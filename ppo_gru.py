@@ -122,6 +122,8 @@ class Args:
     """before every epoch but the first, recompute the stored hidden states with the current weights"""
     bootstrap_truncated: bool = False
     """add the value of the final observation where a time limit ended an episode; without, it counts as terminated"""
+    norm_reward: bool = False
+    """divide rewards by the running standard deviation of the discounted return; logged returns are not divided"""
     norm_adv: Literal["none", "minibatch", "batch"] = "none"
     """normalize the advantages of each minibatch, or of the whole rollout, to mean 0 and standard deviation 1"""
     clip_coef: PositiveFloat = 0.1
@@ -232,6 +234,8 @@ def train(args: Args, run: Run) -> None:
 
         last_value, episodes = collect(agent, run.envs, rollout, args)
         collected = time.perf_counter()
+        if args.norm_reward:
+            rollout.rewards /= rollout.return_scale.update(rollout.rewards, rollout.done, args.gamma)
         rollout.advantages = gae(rollout, last_value, args.gamma, args.gae_lambda)
         rollout.returns = rollout.advantages + rollout.values
         logs = mean_logs(update(agent, run.optimizers, rollout, ent_coef, args), rollout)
@@ -263,6 +267,7 @@ class Rollout:
     next_ground_truth: np.ndarray | None  # (N, G)
     memory_state: MemoryState
     initial_memory: dict[str, Tensor]  # what the rollout began with, for --refresh-memory
+    return_scale: ReturnScale  # for --norm-reward
     advantages: Tensor | None = None  # (T, N)
     returns: Tensor | None = None  # (T, N)
     first_occurrence: Tensor | None = None  # (T * N,) flat index of the first equal observation; see `encode`
@@ -297,6 +302,7 @@ class Rollout:
             next_ground_truth=truth,
             memory_state=state,
             initial_memory=agent.memory.carry(state),
+            return_scale=ReturnScale(torch.zeros(num_envs, device=device)),
         )
 
 
@@ -474,6 +480,33 @@ def gae(rollout: Rollout, last_value: Tensor, gamma: float, gae_lambda: float) -
     for t in reversed(range(len(deltas))):
         advantages[t] = advantage = deltas[t] + decay[t] * advantage
     return advantages
+
+
+@dataclass
+class ReturnScale:
+    """Mean and variance of the discounted return from an episode's start, of all steps (Engstrom et al., 2020).
+
+    Rewards are divided by its deviation; since no mean is subtracted, they keep their sign.
+    """
+
+    discounted: Tensor  # (N,) that of the present episodes
+    count: int = 0
+    mean: float = 0.0
+    variance: float = 0.0
+
+    def update(self, rewards: Tensor, done: Tensor, gamma: float) -> float:
+        """Take in a rollout's rewards (T, N); return the standard deviation, 1 as long as all returns are equal."""
+        returns = torch.zeros_like(rewards)
+        for t in range(len(rewards)):
+            returns[t] = self.discounted * gamma + rewards[t]
+            self.discounted = returns[t] * ~done[t]
+        ours = returns.numel(), returns.double().mean().item(), returns.double().var(correction=0).item()
+        for count, mean, variance in all_gather(ours):  # merged as in Chan et al. (1979)
+            self.count += count
+            share, delta = count / self.count, mean - self.mean
+            self.variance += share * (variance - self.variance + (1 - share) * delta**2)
+            self.mean += share * delta
+        return math.sqrt(self.variance) or 1.0
 
 
 def normalize(x: Tensor) -> Tensor:

@@ -73,6 +73,7 @@ def state_of_process(run: Run) -> dict[str, Any]:
         "next_obs": rollout.next_obs,
         "next_ground_truth": rollout.next_ground_truth,
         "memory": run.agent.memory.carry(rollout.memory_state),
+        "return_scale": vars(rollout.return_scale),
         "torch": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state(rollout.values.device) if rollout.values.is_cuda else None,
         "numpy": np.random.get_state(),  # noqa: NPY002 (it and Python's: environments of other packages may use them)
@@ -280,6 +281,8 @@ def load_process(run: Run, saved: dict[str, Any]) -> None:
     """
     rank, rollout = rank_and_size()[0], run.rollout
     state = saved["processes"][rank]
+    vars(rollout.return_scale).update(state.get("return_scale", {}))  # which older files do not have
+    rollout.return_scale.discounted = rollout.return_scale.discounted.to(rollout.values.device)
     random.setstate(state["python"])
     torch.set_rng_state(state["torch"])
     if state["cuda"] is not None and rollout.values.is_cuda:
@@ -288,6 +291,7 @@ def load_process(run: Run, saved: dict[str, Any]) -> None:
     arrays = map_nested({name: state[name] for name in names}, Tensor, Tensor.numpy)
     np.random.set_state(arrays["numpy"])  # noqa: NPY002
     if arrays["environments"] is None:
+        rollout.return_scale.discounted.zero_()
         if rank == 0:
             print(f"{run.envs.spec.id} has no state to save: every environment begins a new episode", file=sys.stderr)
         return

@@ -63,7 +63,7 @@ RUNS = {
         "script": ppo_trxl, "env_id": "MortarMayhem-Grid-v0", "trxl_gate": "gru", "eval_interval": 1, "eval_levels": 1,
         "eval_max_steps": 30,
     },
-    "GRU, Muon": {**GRID, "optimizer": "muon"},
+    "GRU, Muon": {**GRID, "optimizer": "muon", "norm_reward": True},
     "GTrXL, Muon": {"script": ppo_trxl, **ENDLESS, "trxl_gate": "gru", "optimizer": "muon"},
     "TrXL, both heads": {
         "script": ppo_trxl, "env_id": "SearingSpotlights-v0", "ground_truth_coef": 0.1, "reconstruction_coef": 0.1,
