@@ -445,11 +445,11 @@ def test_the_page_is_installed_with_the_module(tmp_path):
     offline = ["--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check"]
     pip = [sys.executable, "-m", "pip", "install", "--quiet", *offline, "--target", site]
     subprocess.run([*pip, Path(__file__).parents[1]], check=True)
-    code = "import enjoy; print(enjoy.__file__); print(enjoy.page({'title': 'CartPole-v1'}, ''))"
+    code = "from ppo_utils import enjoy; print(enjoy.__file__); print(enjoy.page({'title': 'CartPole-v1'}, ''))"
     environ = {**os.environ, "PYTHONPATH": site}
     made = subprocess.run([sys.executable, "-c", code], env=environ, capture_output=True, text=True, check=True)
     file, page = made.stdout.split("\n", 1)
-    assert file == os.path.join(site, "enjoy.py")
+    assert file == os.path.join(site, "ppo_utils", "enjoy.py")
     assert page.rstrip() == enjoy.page({"title": "CartPole-v1"}, "").rstrip()
     assert data_of(page) == {"title": "CartPole-v1"}
 

@@ -1,0 +1,97 @@
+"""Both distributions: all of the repository, and the environments alone."""
+
+import subprocess
+import sys
+from email import message_from_bytes
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ENVS = ROOT / "memory_gym_envs"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """Give a function that builds a wheel of the project in a folder, without network."""
+
+    def build(project):
+        out = tmp_path_factory.mktemp("wheel")
+        command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(out)]
+        subprocess.run(command, cwd=project, check=True, capture_output=True)
+        (path,) = out.iterdir()
+        return ZipFile(path)
+
+    return build
+
+
+@pytest.fixture(scope="module")
+def alone(wheel):
+    """Give the wheel of the environments alone."""
+    return wheel(ENVS)
+
+
+@pytest.fixture(scope="module")
+def whole(wheel):
+    """Give the wheel of the whole repository."""
+    return wheel(ROOT)
+
+
+def modules(built):
+    return {name for name in built.namelist() if ".dist-info/" not in name}
+
+
+def metadata(built):
+    (name,) = (name for name in built.namelist() if name.endswith(".dist-info/METADATA"))
+    return message_from_bytes(built.read(name))
+
+
+def run(site, *arguments):
+    """Run Python with what was installed into the folder, from there, so that the clone is not found."""
+    return subprocess.run([sys.executable, *arguments], cwd=site, capture_output=True, text=True, check=False)
+
+
+def test_the_environments_alone(alone):
+    sources = {f"memory_gym_envs/{path.name}" for path in ENVS.glob("*.py")}
+    assert modules(alone) == sources | {"memory_gym_envs/py.typed"}
+    for name in modules(alone):
+        assert alone.read(name) == (ROOT / name).read_bytes()
+
+
+def test_they_need_numpy_and_gymnasium(alone):
+    needed = metadata(alone).get_all("Requires-Dist")
+    assert [line for line in needed if "extra ==" not in line] == ["gymnasium<2,>=1.1", "numpy>=2"]
+    assert set(metadata(alone).get_all("Provides-Extra")) == {"play", "sb3"}
+
+
+def test_they_say_who_made_them(alone, whole):
+    for built in (alone, whole):
+        about = metadata(built)
+        assert about["Author"] == "The memory-gym-baselines authors"
+        assert about["License-Expression"] == "MIT"
+        assert len(about.get_all("Project-URL")) == 2
+        assert "Programming Language :: Python :: 3" in about.get_all("Classifier")
+        (licence,) = (name for name in built.namelist() if name.endswith("LICENSE"))
+        assert built.read(licence) == (ROOT / "LICENSE").read_bytes()
+    assert metadata(alone)["Version"] == metadata(whole)["Version"]
+
+
+def test_they_work_alone(alone, tmp_path):
+    alone.extractall(tmp_path)
+    code = "import gymnasium, memory_gym_envs as m; gymnasium.make_vec(m.IDS[0], num_envs=2).reset(); print(m.__file__)"
+    done = run(tmp_path, "-c", code)
+    assert (done.stdout.strip(), done.stderr) == (str(tmp_path / "memory_gym_envs" / "__init__.py"), "")
+
+
+def test_the_whole_repository_leaves_common_names_free(whole, tmp_path):
+    top = {name.partition("/")[0] for name in modules(whole)}
+    assert top == {"memory_gym_envs", "ppo_utils", "ppo_gru.py", "ppo_trxl.py"}
+    for name in ("evaluate.py", "enjoy.py", "enjoy.html"):
+        assert whole.read(f"ppo_utils/{name}") == (ROOT / name).read_bytes()
+    assert "memory_gym_envs/py.typed" in modules(whole)
+    whole.extractall(tmp_path)
+    for name in ("evaluate", "enjoy"):
+        done = run(tmp_path, "-m", f"ppo_utils.{name}", "--help")
+        assert (done.stderr, done.returncode) == ("", 0)
+        assert "usage: " in done.stdout
