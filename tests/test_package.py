@@ -95,3 +95,14 @@ def test_the_whole_repository_leaves_common_names_free(whole, tmp_path):
         done = run(tmp_path, "-m", f"ppo_utils.{name}", "--help")
         assert (done.stderr, done.returncode) == ("", 0)
         assert "usage: " in done.stdout
+
+
+@pytest.mark.parametrize(("project", "name"), [(ROOT, "ppo_utils"), (ROOT, "evaluate"), (ENVS, "memory_gym_envs")])
+def test_an_editable_installation_is_the_clone(project, name, tmp_path):
+    build = f"from hatchling.build import build_editable; print(build_editable({str(tmp_path)!r}))"
+    made = subprocess.run([sys.executable, "-c", build], cwd=project, capture_output=True, text=True, check=True)
+    ZipFile(tmp_path / made.stdout.strip()).extractall(tmp_path)
+    # -S: without what else is installed. The folder and then, by the .pth file in it, the clone are all there is to find.
+    find = f"import site, importlib.util as u; site.addsitedir('.'); print(u.find_spec({name!r}).origin)"
+    done = run(tmp_path, "-S", "-c", find)
+    assert Path(done.stdout.strip()).is_relative_to(ROOT), done.stderr
