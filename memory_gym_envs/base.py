@@ -43,12 +43,16 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         obs_type: "pixels" (the id's own observation space) or "vector": a flat (V,) float32 vector of what the frame
             shows, and of nothing that it hides; no frame is drawn then. `variant.entries` says what is in it.
         options: reset parameters that are this environment's defaults, for resets that do not give them.
+        autoreset_mode: when an episode that ends is reset: in the same step, in the next one, or by the caller.
+        max_episode_steps: truncates longer episodes, as `gym.make(id, max_episode_steps=...)` does.
 
     Raises ValueError for any other argument value.
 
     Observations, rewards (N,) float64, terminations and truncations (N,) bool and infos are fresh arrays at every call.
     An episode that ends is reset in the same step: `final_obs` and `final_info` hold its last observation and info, in
-    the layout of Gymnasium's `SyncVectorEnv`. Every info has `ground_truth` (N, G) float64.
+    the layout of Gymnasium's `SyncVectorEnv`. Every info has `ground_truth` (N, G) float64. With
+    `AutoresetMode.NEXT_STEP`, the last observation and info are returned as they are, and the next step resets the
+    lane, whatever its action. With `DISABLED`, the caller resets it, by `reset_mask`, before the next step.
 
     Each lane has a generator of its own, Gymnasium's `np_random(seed)`; nothing is drawn from anywhere else.
     """
@@ -62,7 +66,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
     tables: ClassVar[tuple[str, ...]] = ("_agent_tables",)  # attributes that place_tables() makes, too large to pickle
     growing: ClassVar[tuple[str, ...]] = ()  # arrays of `state` that are widened along their last axis when needed
     truth_high: ClassVar[float] = 1.0  # the ground truth's largest value; the least is 0
-    kept = ("ready", "settings", "_rngs", "_level_rngs", "_seeds")  # besides the arrays of `state`
+    kept = ("ready", "settings", "_rngs", "_level_rngs", "_seeds", "_over")  # besides the arrays of `state`
 
     def __init__(
         self,
@@ -73,6 +77,8 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         start_level: int = 0,
         obs_type: str = "pixels",
         options: Mapping[str, Any] | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        max_episode_steps: int | None = None,
     ):
         if variant not in self.variants:
             raise ValueError(f"variant must be one of {', '.join(self.variants)}, not {variant!r}")
@@ -80,11 +86,20 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             raise ValueError(f"render_mode must be None, {' or '.join(map(repr, RENDER_MODES))}, not {render_mode!r}")
         if obs_type not in OBS_TYPES:
             raise ValueError(f"obs_type must be {' or '.join(map(repr, OBS_TYPES))}, not {obs_type!r}")
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            modes = ", ".join(f"{mode} or {mode.value!r}" for mode in AutoresetMode)
+            raise ValueError(f"autoreset_mode must be one of {modes}, not {autoreset_mode!r}") from None
+        if max_episode_steps is not None:
+            max_episode_steps = checked_integer("max_episode_steps", max_episode_steps, 1)
+        self.max_episode_steps = max_episode_steps
         self.num_envs = checked_integer("num_envs", num_envs, 1)
         self.num_levels = checked_integer("num_levels", 0 if num_levels is None else num_levels, 0, NO_LIMIT)
         self.start_level = checked_integer("start_level", start_level, 0)
         self.variant_id, self.variant, self.render_mode = variant, self.variants[variant], render_mode
-        self.metadata = {**type(self).metadata, "render_fps": self.variant.render_fps}
+        changed = {"render_fps": self.variant.render_fps, "autoreset_mode": self.autoreset_mode}
+        self.metadata = {**type(self).metadata, **changed}
         self.obs_type = obs_type
         self.single_observation_space, self.single_action_space = self.spaces()
         if obs_type == "vector":
@@ -99,6 +114,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         self.defaults = resolve(self.variant.options, options, variant)
         self.settings = [self.defaults] * self.num_envs  # each lane's reset options, never changed in place
         self.ready = False
+        self._over = np.zeros(self.num_envs, bool)  # lanes that wait for a reset; in the same-step mode, none does
         self.allocate()
 
     # ---- what a family provides ----
@@ -168,14 +184,16 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         return self.observe(ALL), self._truth_info(lanes)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One step of every lane; lanes whose episode ends are reset at once.
+        """One step of every lane; lanes whose episode ends are reset when `autoreset_mode` says.
 
         actions: (N,) or (N, 2) integers. Raises ValueError for any other shape, type or range, and Gymnasium's
         ResetNeeded before the first reset.
         """
         if not self.ready:
             raise gym.error.ResetNeeded("call reset() before step()")
-        rewards, terminated, truncated = self.advance(self.checked_actions(actions))
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
+            return self._step_and_wait(self.checked_actions(actions))
+        rewards, terminated, truncated = self._advance(self.checked_actions(actions))
         observations, infos = self.observe(ALL), {}
         (ended,) = (terminated | truncated).nonzero()
         if ended.size:
@@ -230,8 +248,11 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
     @property
     def arguments(self) -> dict[str, Any]:
         """What it was made with; a saved state fits no other."""
-        names = ("num_envs", "num_levels", "start_level", "obs_type")
-        return {"id": self.variant_id, **{name: getattr(self, name) for name in names}}
+        names = ("num_envs", "num_levels", "start_level", "obs_type", "max_episode_steps")
+        values = {"id": self.variant_id, **{name: getattr(self, name) for name in names}}
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
+            values["autoreset_mode"] = self.autoreset_mode.value
+        return values
 
     def get_state(self) -> dict[str, Any]:
         """The lanes' arrays, options, seeds and generators, in plain values that later steps do not change."""
@@ -242,6 +263,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
 
         Raises ValueError for the state of another version of the environment; nothing has changed then.
         """
+        state = {"_over": np.zeros(self.num_envs, bool), **state}  # states of earlier versions are without
         self._check_state(state)
         arrays, settings = restored(state["arrays"]), [self.resolve(each) for each in state["settings"]]
         super().set_state({**state, "settings": settings})
@@ -258,7 +280,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             fixed, shape = slice(ours.ndim - (name in self.growing)), arrays[name].shape
             if len(shape) != ours.ndim or shape[fixed] != ours.shape[fixed]:
                 raise ValueError(f"its array {name} has the shape {shape}, not {ours.shape}")
-        for name in ("settings", "_rngs", "_level_rngs", "_seeds"):
+        for name in ("settings", "_rngs", "_level_rngs", "_seeds", "_over"):
             if len(state[name]) != self.num_envs:
                 raise ValueError(f"its {name} are of {len(state[name])} lanes, not of {self.num_envs}")
 
@@ -277,8 +299,39 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         self._next_levels(lanes, seeds)
         self.ready = True
 
+    def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """One step of the rules, which `max_episode_steps` may end: like Gymnasium's TimeLimit, whatever else does."""
+        rewards, terminated, truncated = self.advance(actions)
+        if self.max_episode_steps is not None:
+            truncated = truncated | (self.state.length >= self.max_episode_steps)
+        return rewards, terminated, truncated
+
+    def _step_and_wait(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One step in which lanes that wait since the last one are reset, or have to have been, and others begin to."""
+        waiting = np.flatnonzero(self._over)
+        if waiting.size and self.autoreset_mode is AutoresetMode.DISABLED:
+            raise gym.error.ResetNeeded(f"the episodes of lanes {waiting.tolist()} are over: reset them by reset_mask")
+        if not waiting.size:
+            rewards, terminated, truncated = self._advance(actions)
+        else:
+            # All lanes advance at once. These do it in a level that nobody sees, by generators that nobody needs.
+            rngs, self._rngs = self._rngs, [*self._rngs]
+            for lane in waiting.tolist():
+                self._rngs[lane] = np.random.default_rng(0)
+            self.begin(waiting)
+            rewards, terminated, truncated = self._advance(actions)
+            self._rngs = rngs
+            self._next_levels(waiting, [None] * self.num_envs)
+            rewards[waiting], terminated[waiting], truncated[waiting] = 0.0, False, False
+        self._over = terminated | truncated
+        infos = self._truth_info(None)
+        if self._over.any():
+            infos.update(self._summaries(np.flatnonzero(self._over)))
+        return self.observe(ALL), rewards, terminated, truncated, infos
+
     def _next_levels(self, lanes: np.ndarray, seeds: list[int | None]) -> None:
         """Starts the lanes' next episodes. seeds: one for every lane of N."""
+        self._over[lanes] = False
         for lane in lanes.tolist():
             self._seed(lane, seeds[lane])
         self.begin(lanes)
@@ -334,13 +387,17 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             final_obs[lane] = one_of(observations, lane)
         truth = self.ground_truth()
         truth[~mask] = 0.0
-        final_info: dict[str, np.ndarray] = {}
-        for key, values in self.summary(ended).items():
-            column = np.zeros(self.num_envs, values.dtype)
-            column[ended] = values
-            final_info[key], final_info[f"_{key}"] = column, mask.copy()
+        final_info = self._summaries(ended)
         final_info.update(ground_truth=truth, _ground_truth=mask.copy())
         return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask.copy()}
+
+    def _summaries(self, ended: np.ndarray) -> dict[str, np.ndarray]:
+        """The ended episodes in numbers, each (N,) with its mask."""
+        infos: dict[str, np.ndarray] = {}
+        for key, values in self.summary(ended).items():
+            infos[key], infos[f"_{key}"] = np.zeros(self.num_envs, values.dtype), np.zeros(self.num_envs, bool)
+            infos[key][ended], infos[f"_{key}"][ended] = values, True
+        return infos
 
 
 def numbered(every: list[Any]) -> tuple[tuple[Any, ...], list[int]]:

@@ -1,0 +1,116 @@
+"""Other autoreset modes than same-step, and a limit of steps: as Gymnasium's own vector environment does it."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import vector as wrappers
+from helpers import EACH, EACH_OBS, HASTY, check_same, make, roll
+from players import FAMILY
+from test_lanes import CHANGED, LANES, OPTIONS, Told, masked, mixed_actions
+
+NEXT, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED
+
+
+def both(env_id, mode, **arguments):
+    """N environments of ours, and N single ones in Gymnasium's vector environment."""
+    ours = gym.make_vec(env_id, num_envs=LANES, autoreset_mode=mode, **arguments)
+    lanes = [lambda: Told(gym.make(env_id, disable_env_checker=True, **arguments))] * LANES
+    return ours, SyncVectorEnv(lanes, autoreset_mode=mode)
+
+
+def reset_both(ours, theirs, seed=None, options=None, mask=None):
+    for lane in range(LANES) if mask is None else np.flatnonzero(mask):
+        theirs.envs[lane].options = options
+    check_same(*(envs.reset(seed=seed, options=masked(options, mask)) for envs in (ours, theirs)))
+
+
+@EACH_OBS
+@pytest.mark.parametrize("levels", [{}, {"num_levels": 3, "start_level": 40}], ids=["any level", "3 levels"])
+def test_next_step_is_gymnasiums(env_id, obs_type, levels):
+    ours, theirs = both(env_id, NEXT, obs_type=obs_type, **levels)
+    rng, ended = np.random.default_rng(0), 0
+    resets = [
+        (11, HASTY[FAMILY[env_id]], None),
+        ([5, None, 6, None, 0], OPTIONS[env_id], None),
+        (None, CHANGED[FAMILY[env_id]], np.array([True, False, False, True, False])),  # some in the wait for a reset
+        (None, None, None),
+    ]
+    for seed, options, mask in resets:
+        reset_both(ours, theirs, seed, options, mask)
+        for _ in range(80):
+            actions = mixed_actions(ours, rng)
+            result = ours.step(actions)
+            check_same(result, theirs.step(actions))
+            ended += np.count_nonzero(result[2] | result[3])
+        for lane in range(LANES):
+            assert ours.np_random_seed[lane] == theirs.np_random_seed[lane]
+            assert ours.np_random[lane].bit_generator.state == theirs.np_random[lane].bit_generator.state
+    assert ended > LANES
+
+
+@EACH
+def test_without_autoreset_the_caller_resets(env_id):
+    ours, theirs = both(env_id, DISABLED)
+    reset_both(ours, theirs, 3, HASTY[FAMILY[env_id]])
+    rng, ended = np.random.default_rng(0), 0
+    for _ in range(150):
+        actions = mixed_actions(ours, rng)
+        result = ours.step(actions)
+        check_same(result, theirs.step(actions))
+        over = result[2] | result[3]
+        if over.any():
+            ended += over.sum()
+            with pytest.raises(gym.error.ResetNeeded, match="reset_mask"):
+                ours.step(actions)
+            reset_both(ours, theirs, None, HASTY[FAMILY[env_id]], over)
+    assert ended > LANES
+
+
+@EACH
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, NEXT])
+def test_limit_of_steps_is_gymnasiums(env_id, mode):
+    ours, theirs = both(env_id, mode, max_episode_steps=23)
+    reset_both(ours, theirs, 0)
+    rng, limits = np.random.default_rng(0), 0
+    for _ in range(80):
+        actions = mixed_actions(ours, rng)
+        *result, infos = ours.step(actions)
+        check_same(result, [*theirs.step(actions)[:4]])
+        ended = infos.get("final_info", infos)
+        if result[3].any():
+            assert (ended["length"][result[3]] == 23).all()  # Gymnasium's do not know that the episode has ended
+            limits += 1
+    assert limits
+
+
+def test_what_gymnasium_wraps():
+    """Its wrappers of observations take no same-step autoreset."""
+    envs = make("SearingSpotlights-v0", obs_type="vector", autoreset_mode=NEXT)
+    assert envs.metadata["autoreset_mode"] is NEXT
+    wrapped = wrappers.NormalizeObservation(wrappers.RecordEpisodeStatistics(envs))
+    wrapped.reset(seed=0, options=HASTY[FAMILY["SearingSpotlights-v0"]])
+    *_, infos = zip(*roll(wrapped, 60), strict=True)
+    ends = [info for info in infos if "episode" in info]
+    assert ends
+    for info in ends:
+        assert np.array_equal(info["episode"]["l"][info["_episode"]], info["length"][info["_episode"]])
+
+
+@EACH
+def test_the_wait_for_a_reset_is_part_of_the_state(env_id):
+    envs, other = (make(env_id, autoreset_mode=NEXT) for _ in range(2))
+    envs.reset(seed=0, options=HASTY[FAMILY[env_id]])
+    while not envs._over.any():
+        envs.step(envs.action_space.sample())
+    other.set_state(envs.get_state())
+    check_same(roll(envs, 50), roll(other, 50))
+
+
+def test_modes_by_name_and_wrong_ones():
+    assert make("MysteryPath-v0", autoreset_mode="NextStep").autoreset_mode is NEXT
+    with pytest.raises(ValueError, match=r"autoreset_mode must be one of .*'NextStep'.*, not 'next'") as error:
+        make("MysteryPath-v0", autoreset_mode="next")
+    assert "\n" not in str(error.value)
+    with pytest.raises(ValueError, match="max_episode_steps must be an integer of at least 1, not 0"):
+        make("MysteryPath-v0", max_episode_steps=0)
