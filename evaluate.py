@@ -24,6 +24,7 @@ import json
 import logging
 import math
 import os
+import re
 import sys
 import textwrap
 import zlib
@@ -193,7 +194,7 @@ def task_of(args: dict[str, Any]) -> str:
 
 def own_metric(env_id: str) -> str:
     """Return the name of the environment's own metric."""
-    name = env_id.rpartition(":")[2]
+    name = re.split("[:/]", env_id)[-1]  # without module and namespace
     return next((metric for start, metric in OWN_METRIC.items() if name.startswith(start)), "return")
 
 

@@ -1,6 +1,8 @@
 """Memory Gym's environments, batched: importing this package registers their ids with Gymnasium.
 
-`gym.make(id)` makes one environment, and `gym.make_vec(id, num_envs=N)` N of them in one object.
+`gym.make(id)` makes one environment, and `gym.make_vec(id, num_envs=N)` N of them in one object. Each id also exists in
+a namespace, as memory_gym_envs/MortarMayhem-v0, since the original registers the same bare ids: importing it too
+leaves `gym.make` of those to whichever was imported last.
 """
 
 from gymnasium.envs.registration import register
@@ -28,9 +30,10 @@ IDS = tuple(variant for family in FAMILIES for variant in family.variants)
 
 for _family in FAMILIES:
     for _id in _family.variants:
-        register(
-            id=_id,
-            entry_point="memory_gym_envs.single:MemoryGymEnv",
-            vector_entry_point=f"{_family.__module__}:{_family.__name__}",
-            kwargs={"variant": _id},
-        )
+        for _name in (_id, f"memory_gym_envs/{_id}"):
+            register(
+                id=_name,
+                entry_point=f"memory_gym_envs.single:{_family.__name__}Env",
+                vector_entry_point=f"{_family.__module__}:{_family.__name__}",
+                kwargs={"variant": _id},
+            )

@@ -461,35 +461,91 @@ def set_target(s: State, lanes: np.ndarray | int, tile: np.ndarray | int) -> Non
 
 
 class MortarMayhem(MemoryGymVectorEnv):
-    """Mortar Mayhem (thesis 4.3; memory-gym 1.0.2), N lanes at once.
+    """Mortar Mayhem (thesis 4.3): memorise a sequence of commands, then carry them out in time.
+
+    ## Description
 
     Commands are shown one by one while the agent cannot move (the clue). Then it has `explosion_delay` steps to carry
     out each: move to the neighbouring tile it names, or stay. Then all tiles but the right one burn for
     `explosion_duration` steps, and whoever stands on a burning one has failed.
 
-    Variants:
-        MortarMayhem-v0: 10 commands on a 5 x 5 arena. MortarMayhem-Grid-v0: the same, tile by tile, no diagonals.
-        MortarMayhemB-v0, MortarMayhemB-Grid-v0: the act task alone, the commands given as a vector, no clue.
-        Endless-MortarMayhem-v0: a 6 x 6 torus that fills the screen. One command is shown, then all so far are carried
-            out from where the agent is; a completed sequence grows by one command, which alone is shown.
+    - `MortarMayhem-v0`: 10 commands on a 5 x 5 arena. `MortarMayhem-Grid-v0`: the same, tile by tile, no diagonals.
+    - `MortarMayhemB-v0`, `MortarMayhemB-Grid-v0`: the act task alone, the commands given as a vector, no clue.
+    - `Endless-MortarMayhem-v0`: a 6 x 6 torus that fills the screen. One command is shown, then all so far are carried
+      out from where the agent is; a completed sequence grows by one command, which alone is shown.
 
-    Actions: MultiDiscrete([3, 3]): horizontal (0 none, 1 left, 2 right) and vertical (0 none, 1 up, 2 down). Grid ids
-        Discrete(4): 0 nothing, 1 turn left, 2 turn right, 3 one tile forward. Ignored while a clue is shown.
-    Observation: Box (84, 84, 3) uint8, rows first. The B ids: Dict of `visual_observation`, that Box, and
-        `vector_observation` (180,) float32: 20 commands by 9 one-hot entries in the order of VECTOR_ORDER, zeros after
-        the last command. With obs_type="vector": `VARIANTS[id].entries`.
-    Rewards: `reward_command_success` (0.1) when a command is checked and carried out, `reward_command_failure` (0) on a
-        burning tile, `reward_episode_success` (0) when the last command was.
-    Episode end: terminated by failure, or by the last command's check (not in the endless id). Truncated after
-        `max_steps` steps (the endless id; a failure at that very step counts as termination). With default options an
-        episode takes 58 to 274 steps (table 4.4), Grid 46 to 118, B 19 to 235, B-Grid 7 to 79. The B bounds are one
-        above the thesis' formula (18 to 234, 6 to 78), because the first command has explosion_delay + 1 steps;
-        behind a clue that step is made up for: the reset already shows the clue's first step.
-    Options: `VARIANTS[id].options`. Those marked * are lists, one entry of which is sampled at every reset.
-    Ground truth: (2,) the target tile's column and row, divided by arena size - 1.
-    Final info: `reward`, `length`, `commands_completed` and `success` (in the endless id `max_command_sequence`, the
-        length of the longest completed sequence). commands_completed is a share of the sequence, in the endless id a
-        number of commands.
+    ## Action Space
+
+    `MultiDiscrete([3, 3])`:
+
+    | value | horizontal | vertical |
+    |---|---|---|
+    | 0 | none | none |
+    | 1 | left | up |
+    | 2 | right | down |
+
+    `Discrete(4)`, Grid ids:
+
+    | value | action |
+    |---|---|
+    | 0 | nothing |
+    | 1 | turn left |
+    | 2 | turn right |
+    | 3 | one tile forward |
+
+    Actions are ignored while a clue is shown.
+
+    ## Observation Space
+
+    `Box(0, 255, (84, 84, 3), uint8)`, rows first. The B ids: `Dict` of `visual_observation`, that Box, and
+    `vector_observation` (180,) float32: 20 commands by 9 one-hot entries in the order of VECTOR_ORDER, zeros after the
+    last command. With obs_type="vector" a flat float32 vector: `docs/vectors.md`, `VARIANTS[id].entries`.
+
+    ## Rewards
+
+    `reward_command_success` (0.1) when a command is checked and carried out, `reward_command_failure` (0) on a burning
+    tile, `reward_episode_success` (0) when the last command was.
+
+    ## Episode End
+
+    Terminated by failure, or by the last command's check (not in the endless id). Truncated after `max_steps` steps
+    (the endless id; a failure at that very step counts as termination). With default options an episode takes 58 to
+    274 steps (table 4.4), Grid 46 to 118, B 19 to 235, B-Grid 7 to 79. The B bounds are one above the thesis' formula
+    (18 to 234, 6 to 78), because the first command has explosion_delay + 1 steps; behind a clue that step is made up
+    for: the reset already shows the clue's first step.
+
+    ## Info
+
+    `ground_truth` (2,): the target tile's column and row, divided by arena size - 1. At an episode's end also `reward`,
+    `length`, `commands_completed` and `success` (in the endless id `max_command_sequence`, the length of the longest
+    completed sequence). commands_completed is a share of the sequence, in the endless id a number of commands.
+
+    ## Arguments
+
+    `gym.make(id, ...)` and `gym.make_vec(id, num_envs=N, ...)` take
+
+    | name | default | meaning |
+    |---|---|---|
+    | `render_mode` | None | "rgb_array": what the agent sees; "debug_rgb_array": 336 x 336, with the ground truth |
+    | `num_levels`, `start_level` | None, 0 | resets without a seed play one of so many levels, from the first on |
+    | `obs_type` | "pixels" | or "vector" |
+    | `options` | None | reset parameters that are the environment's defaults |
+    | `max_episode_steps` | None | truncates longer episodes |
+    | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
+
+    `reset(options={...})` takes the same reset parameters, a single environment for one episode. `docs/options.md` and
+    `VARIANTS[id].options` list them. Those marked * are lists, one entry of which is sampled at every reset.
+
+    ## Version History
+
+    - v0: as in memory-gym 1.0.2, but for what follows.
+
+    ## References
+
+    Marco Pleines: Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games. Dissertation, TU
+    Dortmund University. Marco Pleines, Matthias Pallasch, Frank Zimmer, Mike Preuss: Memory Gym, arXiv:2309.17207.
+
+    ## Kept from the original, and differences
 
     Kept from the original: the command that ends the episode counts as uncompleted, even if it had been checked and
         the agent then walked into the fire; failing at the very last command counts as success and completes all

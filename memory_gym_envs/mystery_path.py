@@ -757,33 +757,96 @@ def camera_columns(values: dict[str, Any]) -> tuple[int, int]:
 
 
 class MysteryPath(MemoryGymVectorEnv):
-    """Mystery Path (thesis 4.4; memory-gym 1.0.2), N lanes at once.
+    """Mystery Path (thesis 4.4): follow a path that cannot be seen, by remembering where one fell off.
+
+    ## Description
 
     A path leads over a grid of 7 x 7 tiles, from a random tile of one side to one of the opposite side. Neither is
     seen. An agent that steps off the path falls into a pit, which a red cross shows, and is back at the path's origin
     at the next step, whatever its action.
 
-    Variants:
-        MysteryPath-v0: free movement. MysteryPath-Grid-v0: tile by tile.
-        Endless-MysteryPath-v0: the path goes on to the right for ever, in segments of 7 columns and a transition tile.
-            The camera moves with the agent, which sees the path behind it but cannot walk left.
+    - `MysteryPath-v0`: free movement. `MysteryPath-Grid-v0`: tile by tile.
+    - `Endless-MysteryPath-v0`: the path goes on to the right for ever, in segments of 7 columns and a transition tile.
+      The camera moves with the agent, which sees the path behind it but cannot walk left.
 
-    Actions: MultiDiscrete([3, 3]): horizontal (0 none, 1 left, 2 right) and vertical (0 none, 1 up, 2 down). Grid id
-        Discrete(4): 0 nothing, 1 turn left, 2 turn right, 3 one tile forward. Endless id Discrete(4): 0 nothing,
-        1 right, 2 up, 3 down.
-    Observation: Box (84, 84, 3) uint8, rows first. With obs_type="vector": `VARIANTS[id].entries`.
-    Rewards: `reward_goal` (1) at the goal, `reward_path_progress` (0.1, Grid 0) for every other tile but the origin
-        when it is reached for the first time, `reward_fall_off` (0) in the pit, and `reward_step` (0) at every step.
-    Episode end: terminated at the goal. The endless id: terminated when no new tile was reached for `stamina_level`
-        (20) steps (all tiles are new again after a fall), by falling off in a column left of the best progress, and by
-        falling off at the same place again. Truncated after `max_steps` steps (512, Grid 128, endless no limit; a real
-        end at that very step counts as termination).
-    Options: `VARIANTS[id].options`. Those marked * are lists, one entry of which is sampled at every reset.
-    Ground truth: one-hot, the direction of the path's next tile from where the agent last was on the path: east, north,
-        south, west, (4,); at the goal, the direction that leads to it. Endless id: east, north, south, (3,); where the
-        path goes west, the direction before.
-    Final info: `reward`, `length`, `num_fails` and `success`; in the endless id `max_x`, the rightmost column of the
-        path that was reached, and `tiles_visited`, instead of success.
+    ## Action Space
+
+    `MultiDiscrete([3, 3])`:
+
+    | value | horizontal | vertical |
+    |---|---|---|
+    | 0 | none | none |
+    | 1 | left | up |
+    | 2 | right | down |
+
+    `Discrete(4)`, Grid id:
+
+    | value | action |
+    |---|---|
+    | 0 | nothing |
+    | 1 | turn left |
+    | 2 | turn right |
+    | 3 | one tile forward |
+
+    `Discrete(4)`, endless id:
+
+    | value | action |
+    |---|---|
+    | 0 | nothing |
+    | 1 | right |
+    | 2 | up |
+    | 3 | down |
+
+    ## Observation Space
+
+    `Box(0, 255, (84, 84, 3), uint8)`, rows first. With obs_type="vector" a flat float32 vector: `docs/vectors.md`,
+    `VARIANTS[id].entries`.
+
+    ## Rewards
+
+    `reward_goal` (1) at the goal, `reward_path_progress` (0.1, Grid 0) for every other tile but the origin when it is
+    reached for the first time, `reward_fall_off` (0) in the pit, and `reward_step` (0) at every step.
+
+    ## Episode End
+
+    Terminated at the goal. The endless id: terminated when no new tile was reached for `stamina_level` (20) steps (all
+    tiles are new again after a fall), by falling off in a column left of the best progress, and by falling off at the
+    same place again. Truncated after `max_steps` steps (512, Grid 128, endless no limit; a real end at that very step
+    counts as termination).
+
+    ## Info
+
+    `ground_truth`: one-hot, the direction of the path's next tile from where the agent last was on the path: east,
+    north, south, west, (4,); at the goal, the direction that leads to it. Endless id: east, north, south, (3,); where
+    the path goes west, the direction before. At an episode's end also `reward`, `length`, `num_fails` and `success`; in
+    the endless id `max_x`, the rightmost column of the path that was reached, and `tiles_visited`, instead of success.
+
+    ## Arguments
+
+    `gym.make(id, ...)` and `gym.make_vec(id, num_envs=N, ...)` take
+
+    | name | default | meaning |
+    |---|---|---|
+    | `render_mode` | None | "rgb_array": what the agent sees; "debug_rgb_array": 336 x 336, with the ground truth |
+    | `num_levels`, `start_level` | None, 0 | resets without a seed play one of so many levels, from the first on |
+    | `obs_type` | "pixels" | or "vector" |
+    | `options` | None | reset parameters that are the environment's defaults |
+    | `max_episode_steps` | None | truncates longer episodes |
+    | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
+
+    `reset(options={...})` takes the same reset parameters, a single environment for one episode. `docs/options.md` and
+    `VARIANTS[id].options` list them. Those marked * are lists, one entry of which is sampled at every reset.
+
+    ## Version History
+
+    - v0: as in memory-gym 1.0.2, but for what follows.
+
+    ## References
+
+    Marco Pleines: Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games. Dissertation, TU
+    Dortmund University. Marco Pleines, Matthias Pallasch, Frank Zimmer, Mike Preuss: Memory Gym, arXiv:2309.17207.
+
+    ## Kept from the original, and differences
 
     Kept from the original: the agent starts as far from its tile's top left corner as its radius, so one of scale 0.48
         or more starts beside the origin; grid ids ignore agent_scale, the endless id show_origin; in the endless id the

@@ -985,32 +985,79 @@ def take_coins(s: State, lane: int, touched: np.ndarray) -> int:
 
 
 class SearingSpotlights(MemoryGymVectorEnv):
-    """Searing Spotlights (thesis 4.5; memory-gym 1.0.2), N lanes at once.
+    """Searing Spotlights (thesis 4.5): collect coins and leave in the dark, away from wandering spotlights.
+
+    ## Description
 
     The light goes out in the first steps. Spotlights wander over the dark screen and show what is in them; each step in
     one costs the agent health. It has to collect the coins and to leave through the exit, which opens then, all from
     memory: of where things were, and of where it has been walking to since it was last seen. A bar at the top shows
     health, the action before the last, and whether the step before the last was rewarded.
 
-    Variants:
-        SearingSpotlights-v0: one coin and the exit; a new spotlight every 40 steps.
-        Endless-SearingSpotlights-v0: one coin after the other, each visible for a moment and to be collected within 160
-            steps; a new spotlight every 50 steps, twice the health, no exit.
+    - `SearingSpotlights-v0`: one coin and the exit; a new spotlight every 40 steps.
+    - `Endless-SearingSpotlights-v0`: one coin after the other, each visible for a moment and to be collected within 160
+      steps; a new spotlight every 50 steps, twice the health, no exit.
 
-    Actions: MultiDiscrete([3, 3]): horizontal (0 none, 1 left, 2 right) and vertical (0 none, 1 up, 2 down).
-    Observation: Box (84, 84, 3) uint8, rows first.
-    Rewards: `reward_coin` (0.25) for a coin, `reward_exit` (1) for leaving, and in every step `reward_inside_spotlight`
-        or `reward_outside_spotlight` (both 0); `reward_death` (0) is added when no health is left.
-    Episode end: terminated when no health is left, by leaving, without an exit by the last coin; in the endless id by
-        `steps_per_coin` steps without a coin. Truncated after `max_steps` steps, unless it ends at that very step. An
-        agent that knows everything needs 14 to 63 steps for the finite task, 33 on average (table 4.5).
-    Options: `VARIANTS[id].options`. Those marked * are lists, one entry of which is sampled at every reset. Radii and
-        speeds of spotlights are sampled between their smallest and largest.
-    Ground truth: (6,) x and y of the agent, of the first coin left and of the exit; the endless id (4,) without the
-        exit. In pixels over 84, so an agent that starts outside the screen has up to 86 / 84; 0 for what is not there.
-    Final info: `reward`, `length`, `agent_health` (share left, negative if the last hit took more than that),
-        `coins_collected` (a share, 1 if there were none; in the endless id a number), and `success` but in the endless
-        id.
+    ## Action Space
+
+    `MultiDiscrete([3, 3])`:
+
+    | value | horizontal | vertical |
+    |---|---|---|
+    | 0 | none | none |
+    | 1 | left | up |
+    | 2 | right | down |
+
+    ## Observation Space
+
+    `Box(0, 255, (84, 84, 3), uint8)`, rows first. With obs_type="vector" a flat float32 vector: `docs/vectors.md`,
+    `VARIANTS[id].entries`.
+
+    ## Rewards
+
+    `reward_coin` (0.25) for a coin, `reward_exit` (1) for leaving, and in every step `reward_inside_spotlight` or
+    `reward_outside_spotlight` (both 0); `reward_death` (0) is added when no health is left.
+
+    ## Episode End
+
+    Terminated when no health is left, by leaving, without an exit by the last coin; in the endless id by
+    `steps_per_coin` steps without a coin. Truncated after `max_steps` steps, unless it ends at that very step. An agent
+    that knows everything needs 14 to 63 steps for the finite task, 33 on average (table 4.5).
+
+    ## Info
+
+    `ground_truth` (6,): x and y of the agent, of the first coin left and of the exit; the endless id (4,) without the
+    exit. In pixels over 84, so an agent that starts outside the screen has up to 86 / 84; 0 for what is not there. At
+    an episode's end also `reward`, `length`, `agent_health` (share left, negative if the last hit took more than that),
+    `coins_collected` (a share, 1 if there were none; in the endless id a number), and `success` but in the endless id.
+
+    ## Arguments
+
+    `gym.make(id, ...)` and `gym.make_vec(id, num_envs=N, ...)` take
+
+    | name | default | meaning |
+    |---|---|---|
+    | `render_mode` | None | "rgb_array": what the agent sees; "debug_rgb_array": 336 x 336, with the ground truth |
+    | `num_levels`, `start_level` | None, 0 | resets without a seed play one of so many levels, from the first on |
+    | `obs_type` | "pixels" | or "vector" |
+    | `options` | None | reset parameters that are the environment's defaults |
+    | `max_episode_steps` | None | truncates longer episodes |
+    | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
+
+    `reset(options={...})` takes the same reset parameters, a single environment for one episode. `docs/options.md` and
+    `VARIANTS[id].options` list them. Those marked * are lists, one entry of which is sampled at every reset.
+    Radii and speeds of spotlights are sampled between their smallest and largest.
+
+    ## Version History
+
+    - v0: as in memory-gym 1.0.2, but for what follows.
+
+    ## References
+
+    Marco Pleines: Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games. Dissertation, TU
+    Dortmund University. Marco Pleines, Matthias Pallasch, Frank Zimmer, Mike Preuss: Memory Gym, arXiv:2309.17207.
+
+    ## Kept from the original, and differences
 
     Kept from the original: the bar shows the action and the reward of the step before the last. A spotlight behind one
     that is removed skips that step, and so does a coin behind a taken one when several are touched at once. The wait

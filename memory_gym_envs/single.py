@@ -6,25 +6,34 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import ALL, RENDER_MODES, lane_seeds
+from memory_gym_envs.base import ALL, RENDER_MODES, MemoryGymVectorEnv, lane_seeds
+from memory_gym_envs.mortar_mayhem import MortarMayhem
+from memory_gym_envs.mystery_path import MysteryPath
 from memory_gym_envs.options import brief
+from memory_gym_envs.searing_spotlights import SearingSpotlights
 
 
 class MemoryGymEnv(gym.Env):
-    """A single environment of any id of this package; `gym.make(id)` returns it.
+    """A single environment of any id of this package; `gym.make(id)` returns the subclass for the id's family.
 
-    Arguments: the id, then those of `MemoryGymVectorEnv` but for num_envs, e.g. render_mode, num_levels, start_level,
-    obs_type, options.
+    Arguments: those of `MemoryGymVectorEnv` that are about one environment. variant is the id, without namespace.
     Observations, actions, rewards, options and infos are those of the id, as its family's class describes them.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 25}
     has_ground_truth_info = True  # every info has it
+    family: ClassVar[type[MemoryGymVectorEnv]]
 
-    def __init__(self, variant: str, render_mode: str | None = None, **arguments: Any):
-        self.batch = gym.make_vec(
-            variant, num_envs=1, vectorization_mode="vector_entry_point", render_mode=render_mode, **arguments
-        )
+    def __init__(
+        self,
+        variant: str,
+        render_mode: str | None = None,
+        num_levels: int | None = None,
+        start_level: int = 0,
+        obs_type: str = "pixels",
+        options: Mapping[str, Any] | None = None,
+    ):
+        self.batch = self.family(variant, 1, render_mode, num_levels, start_level, obs_type, options)
         self.render_mode = render_mode
         self.metadata = {**type(self).metadata, "render_fps": self.batch.metadata["render_fps"]}
         self.observation_space = self.batch.single_observation_space
@@ -96,6 +105,30 @@ class MemoryGymEnv(gym.Env):
         """The reset options of this episode, those that were not given included."""
         return dict(self.batch.settings[0])
 
+    def get_state(self) -> dict[str, Any]:
+        """The whole state in plain values, which later steps do not change: `set_state` goes on exactly from there."""
+        made_with = {**self.batch.arguments, "options": self.batch.defaults}
+        return {"made_with": made_with, "batch": self.batch.get_state(), "needs_reset": self._needs_reset}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Takes over a copy of what get_state() of an environment that was made with the same arguments returned.
+
+        Raises ValueError, in one line, for any other; nothing has changed then.
+        """
+        ours, before = self.get_state()["made_with"], self.batch.get_state()
+        try:
+            for name, theirs in state["made_with"].items():
+                if name == "options":
+                    theirs = self.batch.resolve(theirs)
+                if theirs != ours[name]:
+                    raise ValueError(f"it is of one with {name} {brief(theirs)}, not {brief(ours[name])}")
+            self.batch.set_state(state["batch"])
+            self._needs_reset = bool(state["needs_reset"])
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            self.batch.set_state(before)
+            what = error if isinstance(error, ValueError) else brief(error)
+            raise ValueError(f"this is no state of this environment, {self.batch.variant_id}: {what}") from None
+
     # Gymnasium keeps an environment's generator in these two names; here they are lane 0's.
 
     @property
@@ -113,6 +146,18 @@ class MemoryGymEnv(gym.Env):
     @_np_random_seed.setter
     def _np_random_seed(self, seed: int | None) -> None:
         self.batch._seeds[0] = seed
+
+
+class MortarMayhemEnv(MemoryGymEnv):  # noqa: D101 (it has its family's docstring)
+    __doc__, family = MortarMayhem.__doc__, MortarMayhem
+
+
+class MysteryPathEnv(MemoryGymEnv):  # noqa: D101
+    __doc__, family = MysteryPath.__doc__, MysteryPath
+
+
+class SearingSpotlightsEnv(MemoryGymEnv):  # noqa: D101
+    __doc__, family = SearingSpotlights.__doc__, SearingSpotlights
 
 
 def _only(observations: Any) -> Any:

@@ -24,13 +24,14 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
 
 import enjoy
+import evaluate
 import memory_gym_envs
 import ppo_gru
 import ppo_trxl
 from memory_gym_envs.character import PAD
 from memory_gym_envs.mystery_path import ROWS
 from ppo_utils.checkpoints import make_agent
-from ppo_utils.environments import as_tensors, envs_for
+from ppo_utils.environments import as_tensors, envs_for, is_memory_gym
 from ppo_utils.evaluation import most_probable
 
 AGENTS = {
@@ -192,6 +193,16 @@ def test_actions_do_what_the_page_calls_them(env_id):
                 assert (int(s.facing[0]), moved == (0, -1)) == (FACINGS[name], name == "forward"), name
             else:
                 assert moved == MOVES[name], name
+
+
+@pytest.mark.parametrize("env_id", memory_gym_envs.IDS)
+def test_ids_with_their_namespace(env_id):
+    name = f"memory_gym_envs/{env_id}"
+    assert is_memory_gym(name)
+    assert evaluate.own_metric(name) == evaluate.own_metric(env_id)
+    assert enjoy.family_of(name) == enjoy.family_of(env_id) is not None
+    branches = [np.ones(3), np.ones(3)] if "MultiDiscrete" in str(gym.make(env_id).action_space) else [np.ones(4)]
+    assert enjoy.branch_names(name, branches) == enjoy.branch_names(env_id, branches)
 
 
 def test_seed_is_the_level_and_the_actions(saved):

@@ -102,7 +102,7 @@ def test_an_editable_installation_is_the_clone(project, name, tmp_path):
     build = f"from hatchling.build import build_editable; print(build_editable({str(tmp_path)!r}))"
     made = subprocess.run([sys.executable, "-c", build], cwd=project, capture_output=True, text=True, check=True)
     ZipFile(tmp_path / made.stdout.strip()).extractall(tmp_path)
-    # -S: without what else is installed. The folder and then, by the .pth file in it, the clone are all there is to find.
+    # -S: without what else is installed. Found are the folder and then, by the .pth file in it, the clone.
     find = f"import site, importlib.util as u; site.addsitedir('.'); print(u.find_spec({name!r}).origin)"
     done = run(tmp_path, "-S", "-c", find)
     assert Path(done.stdout.strip()).is_relative_to(ROOT), done.stderr

@@ -86,3 +86,72 @@ def test_an_observation_depends_on_this_episode_alone(env_id, obs_type):
     check_same(env.reset(seed=8), fresh.reset(seed=8))
     for _ in range(5):
         check_same(env.step(still), fresh.step(still))
+
+
+@EACH_OBS
+def test_a_single_environment_goes_on_from_its_state(env_id, obs_type):
+    arguments = {"obs_type": obs_type, "options": HASTY[FAMILY[env_id]]}
+    env, other = (gym.make(env_id, **arguments).unwrapped for _ in range(2))
+    env.reset(seed=3, options={"agent_scale": 0.3})
+    other.reset(seed=8)
+    actions = [env.action_space.sample() for _ in range(60)]
+    play_on(env, actions[:30])
+    state = env.get_state()
+    first = play_on(env, actions[30:])
+    for each in (other, env):  # the state is as it was
+        each.set_state(state)
+        check_same(first, play_on(each, actions[30:]))
+
+
+def play_on(env, actions):
+    """All that steps return, with resets where an episode has ended."""
+    results = []
+    for action in actions:
+        results.append(env.step(action))
+        if results[-1][2] or results[-1][3]:
+            results.append(env.reset())
+    return results
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        ({"id": "MysteryPath-Grid-v0"}, "it is of one with id 'MysteryPath-Grid-v0', not 'MysteryPath-v0'"),
+        ({"obs_type": "vector"}, "it is of one with obs_type 'vector', not 'pixels'"),
+        ({"num_levels": 4}, "it is of one with num_levels 4, not 0"),
+        ({"options": {"max_steps": 9}}, "it is of one with options {'max_steps': 9, "),
+    ],
+)
+def test_the_state_of_another_environment(other, message):
+    env, theirs = gym.make("MysteryPath-v0").unwrapped, gym.make(**{"id": "MysteryPath-v0", **other}).unwrapped
+    theirs.reset(seed=0)
+    check_refused(env, theirs.get_state(), message)
+
+
+def test_what_is_no_state():
+    env = gym.make("MysteryPath-v0").unwrapped
+    env.reset(seed=0)
+    check_refused(env, None, "TypeError")
+    check_refused(env, {}, "KeyError('made_with')")
+    for change, message in (
+        ({"settings": [{"arena_size": 3}]}, "MysteryPath-v0 has no option 'arena_size'"),
+        ({"settings": [{"max_steps": -2}]}, "option 'max_steps' must be"),
+        ({"arrays": {}}, "the saved state is of another version of MysteryPath-v0"),
+        ({"_rngs": []}, "its _rngs are of 0 lanes, not of 1"),
+    ):
+        state = env.get_state()
+        check_refused(env, {**state, "batch": {**state["batch"], **change}}, message)
+    state = env.get_state()
+    state["batch"]["arrays"]["pos"] = np.zeros((2, 2), np.int64)
+    check_refused(env, state, "its array pos has the shape (2, 2), not (1, 2)")
+
+
+def check_refused(env, state, message):
+    """One line says what is wrong with the state, and the environment is as it was."""
+    env.reset(seed=0)
+    before = pickle.dumps(env.get_state())
+    with pytest.raises(ValueError, match="this is no state of this environment, MysteryPath-v0: ") as error:
+        env.set_state(state)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+    assert pickle.dumps(env.get_state()) == before
