@@ -55,7 +55,8 @@ def test_metadata(env_id):
     for each in (env, envs):
         assert each.metadata["render_modes"] == ["rgb_array", "debug_rgb_array"]
         assert each.metadata["render_fps"] == fps
-    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    # TorchRL's GymWrapper asks for the attribute, Gymnasium's wrappers for the metadata.
+    assert envs.metadata["autoreset_mode"] is envs.autoreset_mode is AutoresetMode.SAME_STEP
     assert envs.spec.id == env_id
 
 
