@@ -57,7 +57,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
     Each lane has a generator of its own, Gymnasium's `np_random(seed)`; nothing is drawn from anywhere else.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as Gymnasium declares it)
         "render_modes": list(RENDER_MODES),
         "render_fps": 25,
         "autoreset_mode": AutoresetMode.SAME_STEP,
@@ -66,7 +66,8 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
     tables: ClassVar[tuple[str, ...]] = ("_agent_tables",)  # attributes that place_tables() makes, too large to pickle
     growing: ClassVar[tuple[str, ...]] = ()  # arrays of `state` that are widened along their last axis when needed
     truth_high: ClassVar[float] = 1.0  # the ground truth's largest value; the least is 0
-    kept = ("ready", "settings", "_rngs", "_level_rngs", "_seeds", "_over")  # besides the arrays of `state`
+    kept: ClassVar[tuple[str, ...]] = ("ready", "settings", "_rngs", "_level_rngs", "_seeds", "_over")
+    state: Any  # the family's State, a dataclass of arrays; saved besides what is `kept`
 
     def __init__(
         self,
@@ -106,13 +107,17 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             self.single_observation_space = vector_space(self.variant.entries)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._action_shape = (self.num_envs, *self.single_action_space.shape)
+        self._action_shape = (self.num_envs, *(self.single_action_space.shape or ()))
         self._action_count = _choices(self.single_action_space)
-        self._rngs: list[np.random.Generator | None] = [None] * self.num_envs
-        self._level_rngs: list[np.random.Generator | None] = [None] * self.num_envs
+        self._rngs: list[Any] = [None] * self.num_envs  # generators, from the first reset on
+        self._level_rngs: list[Any] = [None] * self.num_envs  # likewise, with num_levels
         self._seeds: list[int | None] = [None] * self.num_envs
         self.defaults = resolve(self.variant.options, options, variant)
         self.settings = [self.defaults] * self.num_envs  # each lane's reset options, never changed in place
+        names = ("num_envs", "num_levels", "start_level", "obs_type", "max_episode_steps")
+        self.arguments = {"id": variant, **{name: getattr(self, name) for name in names}}
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
+            self.arguments["autoreset_mode"] = self.autoreset_mode.value
         self.ready = False
         self._over = np.zeros(self.num_envs, bool)  # lanes that wait for a reset; in the same-step mode, none does
         self.allocate()
@@ -218,17 +223,17 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             self.annotate(frame, lane)
         return tuple(large)
 
-    @property
-    def np_random(self) -> tuple[np.random.Generator | None, ...]:
+    @property  # type: ignore[misc]
+    def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[override] # as in SyncVectorEnv
         """Each lane's generator; None before the first reset."""
         return tuple(self._rngs)
 
     @property
-    def np_random_seed(self) -> tuple[int | None, ...]:
+    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
         """What each lane's generator was seeded with; -1 if it was set from outside."""
         return tuple(self._seeds)
 
-    def set_generator(self, lane: int, rng: np.random.Generator) -> None:
+    def set_generator(self, lane: int, rng: np.random.Generator | None) -> None:
         """Makes the lane draw from this generator from now on."""
         self._rngs[lane], self._seeds[lane] = rng, -1
 
@@ -244,15 +249,6 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
     def __setstate__(self, values: dict[str, Any]) -> None:
         self.__dict__.update(values)
         self.place_tables()
-
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """What it was made with; a saved state fits no other."""
-        names = ("num_envs", "num_levels", "start_level", "obs_type", "max_episode_steps")
-        values = {"id": self.variant_id, **{name: getattr(self, name) for name in names}}
-        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
-            values["autoreset_mode"] = self.autoreset_mode.value
-        return values
 
     def get_state(self) -> dict[str, Any]:
         """The lanes' arrays, options, seeds and generators, in plain values that later steps do not change."""
@@ -416,7 +412,10 @@ def widened(array: np.ndarray, width: int, filler: float = 0) -> np.ndarray:
 
 def _choices(space: gym.Space) -> int:
     """How many values an action has: the families' branches are all equally wide."""
-    return int(space.nvec[0]) if isinstance(space, gym.spaces.MultiDiscrete) else int(space.n)
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        return int(space.nvec[0])
+    assert isinstance(space, gym.spaces.Discrete)
+    return int(space.n)
 
 
 def lane_seeds(seed: Any, num_envs: int) -> list[int | None]:

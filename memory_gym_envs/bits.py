@@ -151,7 +151,7 @@ _PLANES = np.stack(
     ]
 )[:, None]
 # (8 * 42, 3) float32: what their counts add to the number of pixels and to the sums of x and of y.
-_MOMENTS = np.zeros((1 + _DIGITS, LINES, 3), np.float32)
+_MOMENTS: np.ndarray = np.zeros((1 + _DIGITS, LINES, 3), np.float32)
 _MOMENTS[0] = np.stack([np.ones(LINES), np.full(LINES, 0.5), _Y + 0.5], axis=1)
 _MOMENTS[1:, :, 1] = 1 << np.arange(_DIGITS)[:, None]
 _MOMENTS = _MOMENTS.reshape(-1, 3)

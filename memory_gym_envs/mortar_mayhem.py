@@ -51,7 +51,7 @@ VECTOR_AT = [VECTOR_ORDER.index(command) for command in COMMANDS]
 VECTOR_COMMANDS = 20  # commands that the command vector has room for
 BLANK = 0  # what a clue shows between commands; 1 + command otherwise
 
-EVERY_LANE = np.True_  # a mask, when no lane has to be left out
+EVERY_LANE: Any = np.True_  # a mask, when no lane has to be left out
 
 
 # ---- configuration ----
@@ -287,7 +287,7 @@ def floors() -> np.ndarray:
     """(F, FRAME) uint8, read-only: every arena, blue or burning around each possible target."""
     blue, red = (np.tile(np.array(color, np.uint8), (TILE, TILE, 1)) for color in (LIGHT_BLUE, LIGHT_RED))
     blue[1:-1, 1:-1], red[1:-1, 1:-1] = BLUE, RED
-    table = np.zeros((len(FLOORS), SCREEN, SCREEN, 3), np.uint8)
+    table: np.ndarray = np.zeros((len(FLOORS), SCREEN, SCREEN, 3), np.uint8)
     for frame, (size, target) in zip(table, FLOORS, strict=True):
         origin = SCREEN // 2 - TILE * size // 2
         for x in range(size):
@@ -329,7 +329,7 @@ def symbols() -> np.ndarray:
         [("right", "right_up"), ("up", "left_up"), ("left", "left_down"), ("down", "right_down")]
     ):
         masks[straight], masks[slanted] = np.rot90(arrow, quarter), turned(arrow, 45 + 90 * quarter, 31)
-    table = np.zeros((1 + len(COMMANDS), SYMBOL, SYMBOL, 3), np.uint8)
+    table: np.ndarray = np.zeros((1 + len(COMMANDS), SYMBOL, SYMBOL, 3), np.uint8)
     for command, name in enumerate(COMMANDS):
         mask = masks[name][:SYMBOL, :SYMBOL]
         table[1 + command, : len(mask), : len(mask)][mask] = 255
@@ -653,7 +653,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         if not self._clues_open:
             return EVERY_LANE
         acting = show_clue(self.state, self._lane_clue)
-        self._clues_open = np.count_nonzero(acting) < self.num_envs
+        self._clues_open = bool(np.count_nonzero(acting) < self.num_envs)
         return acting
 
     def _move(self, actions: np.ndarray, acting: np.ndarray) -> None:
@@ -705,7 +705,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         """Fresh vector observations of the lanes, (n, V) float32."""
         s, at = self.state, self._at
         sprite = self._lane_sprites[lanes] + s.facing[lanes]  # (n,)
-        out = np.empty((len(sprite), *self.single_observation_space.shape), np.float32)
+        out = np.empty((len(sprite), *(self.single_observation_space.shape or ())), np.float32)
         if self.variant.clue:
             symbol = s.symbol[lanes]
             sprite += symbol * FACINGS

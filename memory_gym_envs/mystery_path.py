@@ -667,9 +667,10 @@ def write_trail(out: np.ndarray, s: State, lanes: np.ndarray | slice, tables: Ap
         row = owner * SCREEN + y  # (m,)
         shown &= ~(cut & np.isin(row, row[x == 0]))
     if agent is not None:
+        sprite, pos = agent
         corners = np.stack([x, y], axis=1)[:, None] + abs(CORNERS * (TILE - 1) - np.reshape(inset, (-1, 1, 1)))
         free = (corners[..., 0] >= 0) & (corners[..., 0] < np.reshape(width, (-1, 1)))  # (m, 4)
-        shown &= (free & ~covered(tables, *(each[owner] for each in agent), corners + PAD)).any(axis=1)
+        shown &= (free & ~covered(tables, sprite[owner], pos[owner], corners + PAD)).any(axis=1)
     owner, x, y = owner[shown], x[shown], y[shown]
     out[owner, (x // TILE + 1) * SIDE + y // TILE] = 1.0
     # Not all of a path's tiles have the same, where the camera is between two pixels.
@@ -955,7 +956,7 @@ class MysteryPath(MemoryGymVectorEnv):
         before, s.path_step = s.path_step, s.step_at.take(cell)
         s.fallen = s.path_step == PIT
         rewards = s.reward_step.copy()
-        landed = np.count_nonzero(s.path_step != before)
+        landed = int(np.count_nonzero(s.path_step != before))
         if landed:
             enter_tiles(s, self._lane_path, rewards, endless)
         terminated = self._spend_stamina(cell, landed) if endless else s.path_step == s.path_length
@@ -1013,7 +1014,7 @@ class MysteryPath(MemoryGymVectorEnv):
         s, at, endless = self.state, self._at, self.variant.endless
         pos, shows_cross = place_on_screen(s, lanes, endless), s.shows_cross[lanes]
         sprite = (2 * s.view[lanes] + shows_cross) * FACINGS + s.facing[lanes]  # (n,)
-        out = np.zeros((len(sprite), *self.single_observation_space.shape), np.float32)
+        out = np.zeros((len(sprite), *(self.single_observation_space.shape or ())), np.float32)
         write_agent_entries(out[:, at["size"].start : at["facing"].stop], self._appearance, sprite, pos)
         if endless:
             self._write_endless(out, lanes, sprite, pos)

@@ -17,14 +17,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs import IDS
+from memory_gym_envs import IDS, MemoryGymEnv
 from memory_gym_envs.mortar_mayhem import VECTOR_ORDER
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 try:
     import pygame
 except ImportError:
-    pygame = None
+    pygame = None  # type: ignore[assignment]
 
 VIEW = 504  # pixels, six for each of the agent's
 LINE, LINES, COLUMNS = 20, 7, 72  # height of a line of text in pixels, how many there are, and letters in one
@@ -47,7 +47,9 @@ class Game:
 
     def __init__(self, env_id: str, seed: int, debug: bool):
         self.env_id = env_id
-        self.env = gym.make(env_id, render_mode="debug_rgb_array" if debug else "rgb_array").unwrapped
+        env = gym.make(env_id, render_mode="debug_rgb_array" if debug else "rgb_array").unwrapped
+        assert isinstance(env, MemoryGymEnv)
+        self.env = env
         self.held: list[str] = []  # directions, the last pressed last
         self.restart(seed)
 

@@ -151,7 +151,7 @@ def _entries(endless: bool) -> tuple[Entries, ...]:
     action = "the action in the bar, one-hot: none, {}, {}; zeros where it is hidden"
     place = "{}: how many pixels are visible, over 144 and at most 1; x and y of their middle, over 84"
     tiles = "of each tile of 12 x 12 pixels, row by row, the share that is {}; the bar's pixels don't count"
-    table = [
+    table: list[tuple[Any, ...]] = [
         (True, "health", 1, "share of the bar's left half that is green"),
         (True, "horizontal", 3, action.format("left", "right")),
         (True, "vertical", 3, action.format("up", "down")),
@@ -247,8 +247,8 @@ def empty_state(lanes: int) -> State:
     shapes |= {"targets": (lanes, 4), "darkness": (lanes, FADE), "scenery": (2 * lanes, FRAME), "floors": (lanes, 2)}
     floats = ("touch_squared", "targets", "spots", "health", "episode_return", "full_health", "damage")
     rewards = ("reward_inside", "reward_outside", "reward_death", "reward_coin", "reward_exit")
-    kinds = dict.fromkeys((*floats, *rewards), np.float64) | dict.fromkeys(("near_light", "rim", "layered"), bool)
-    kinds |= dict.fromkeys(("darkness", "scenery"), np.uint8)
+    kinds: dict[str, Any] = dict.fromkeys((*floats, *rewards), np.float64)
+    kinds |= dict.fromkeys(("near_light", "rim", "layered"), bool) | dict.fromkeys(("darkness", "scenery"), np.uint8)
     names = State.__dataclass_fields__
     return State(**{name: np.zeros(shapes.get(name, (lanes,)), kinds.get(name, np.int64)) for name in names})
 
@@ -435,7 +435,7 @@ def floors() -> np.ndarray:
     """(4, FRAME) uint8, read-only: the four floors, lit."""
     tile = np.arange(SCREEN) // TILE
     light = (tile[:, None] + tile) % 2 == 0  # (84, 84)
-    table = np.zeros((4, SCREEN, SCREEN, 3), np.uint8)
+    table: np.ndarray = np.zeros((4, SCREEN, SCREEN, 3), np.uint8)
     table[:BLACK_FLOOR] = WHITE
     table[BLUE_FLOOR, ~light], table[RED_FLOOR, ~light] = BLUE, RED
     table = table.reshape(4, FRAME)
@@ -455,7 +455,7 @@ def bars(endless: bool) -> np.ndarray:
     step, 1, 2 for a positive one) and lost health.
     """
     half, quarter = SCREEN // 2, SCREEN // 4
-    table = np.zeros((2, 2, 3, 3, 3, WIDTHS, SCREEN, 3), np.uint8)
+    table: np.ndarray = np.zeros((2, 2, 3, 3, 3, WIDTHS, SCREEN, 3), np.uint8)
     table[:] = (0, 0, 0) if endless else GREY
     table[..., :half, :] = GREEN
     for action, color in enumerate(ACTION_COLORS):
@@ -808,11 +808,12 @@ def sample_frames(s: State, g: VectorTables, lanes: np.ndarray | slice) -> Frame
     bodies, (raised, layer) = slice(spots, -1 if has_exit else None), layers(s, g, lanes)
     cover = shapes[bodies]
     seen, floor = visible_parts(cover, clear)
-    if raised.size:
+    if layer is not None:
         seen[:, raised], floor[raised] = visible_parts_in_layers(cover[:, raised], clear[raised], layer)
     if has_exit:
         seen[EXIT] &= shapes[-1]
-    return FrameSamples(opacity, lit, clear, rim, *key[:, bodies], raised, layer, cover, seen, floor)
+    x, y = key[:, bodies]
+    return FrameSamples(opacity, lit, clear, rim, x, y, raised, layer, cover, seen, floor)
 
 
 def layers(s: State, g: VectorTables, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
@@ -826,9 +827,7 @@ def layers(s: State, g: VectorTables, lanes: np.ndarray | slice) -> tuple[np.nda
     return raised, np.array([layer[raised] for layer in every])[..., None]
 
 
-def visible_parts(
-    cover: np.ndarray, clear: np.ndarray, left: np.ndarray = LINES_BELOW
-) -> tuple[np.ndarray, np.ndarray]:
+def visible_parts(cover: np.ndarray, clear: np.ndarray, left: Any = LINES_BELOW) -> tuple[np.ndarray, np.ndarray]:
     """What is visible of bodies and of the floor behind them, (K, n, 42) and (n, 42).
 
     cover: (K, n, 42) what the bodies cover, from front to back. clear: (n, 42). left: (42,) what nothing covers so far.
@@ -867,7 +866,7 @@ def write_rest(s: State, g: VectorTables, lanes: np.ndarray | slice, sampled: Fr
     cover, seen, (bodies, n, _) = sampled.cover, sampled.seen, sampled.seen.shape
     bright, visible, dusk = sampled.lit & sampled.floor, sampled.clear & sampled.floor, DUSK.take(sampled.opacity)
     if sampled.rim is not None:
-        bright = np.where(s.rim[lanes][:, None], rims_left(sampled), bright)
+        bright = np.where(s.rim[lanes][:, None], rims_left(sampled, sampled.rim), bright)
         dusk = dusk * ~s.rim[lanes]
     lines = np.empty((bodies + 3, n, LINES), np.uint64)
     lines[:bodies] = seen
@@ -906,15 +905,15 @@ def write_tiles(g: VectorTables, seen: np.ndarray, any_: np.ndarray, bright: np.
     if "coins" not in g.at:
         out[:, g.at["light"]] = tile_counts(bright) * TILE_SHARE
         return
-    (lanes,) = any_[g.coin :].any(axis=0).nonzero()
+    lanes = np.flatnonzero(any_[g.coin :].any(axis=0))
     coins = np.bitwise_or.reduce(seen[g.coin :, lanes], axis=0)
     share = tile_counts(np.concatenate([bright, coins])) * TILE_SHARE
     out[:, g.at["light"]], out[lanes, g.at["coins"]] = share[: len(bright)], share[len(bright) :]
 
 
-def rims_left(sampled: FrameSamples) -> np.ndarray:
-    """What is visible of the rims, (n, 42): of any in a dark that is dark enough, and over all that is under it."""
-    rim = sampled.rim & LINES_BELOW & -(sampled.opacity >= FIRST_RIM)[:, None].astype(np.uint64)
+def rims_left(sampled: FrameSamples, rim: np.ndarray) -> np.ndarray:
+    """What is visible of these rims, (n, 42): of any in a dark that is dark enough, and over all that is under it."""
+    rim = rim & LINES_BELOW & -(sampled.opacity >= FIRST_RIM)[:, None].astype(np.uint64)
     if sampled.layer is not None:
         above = np.where(sampled.layer == UNDER, NO_BITS, sampled.cover[:, sampled.raised])
         rim[sampled.raised] &= ~np.bitwise_or.reduce(above, axis=0)
@@ -1141,8 +1140,8 @@ class SearingSpotlights(MemoryGymVectorEnv):
     def place_tables(self) -> None:
         """The tables that step() looks things up in, and where each lane's rows start in them."""
         self._agent_tables = agent_tables(tuple(figure for pair in self.figures for figure in pair))
-        radii = [values[name] for values in self.settings for name in ("spot_min_radius", "spot_max_radius")]
-        radii, endless = (int(min(radii)), int(max(radii))), self.variant.endless
+        every = [values[name] for values in self.settings for name in ("spot_min_radius", "spot_max_radius")]
+        radii, endless = (int(min(every)), int(max(every))), self.variant.endless
         scratch = pixel_scratch(self.num_envs)
         self._drawing = DrawingTables(
             spot_stencils(*radii), self._agent_tables.sheet, coin_and_exit_sheet(self.scales), bars(endless), scratch

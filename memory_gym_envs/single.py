@@ -20,7 +20,7 @@ class MemoryGymEnv(gym.Env):
     Observations, actions, rewards, options and infos are those of the id, as its family's class describes them.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 25}
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 25}  # noqa: RUF012 (as Gymnasium's)
     has_ground_truth_info = True  # every info has it
     family: ClassVar[type[MemoryGymVectorEnv]]
 
@@ -64,7 +64,7 @@ class MemoryGymEnv(gym.Env):
         if self._needs_reset:
             raise gym.error.ResetNeeded("call reset() before step(), at the start and after every episode's end")
         batch = self.batch
-        lone = action[None] if isinstance(action, (np.ndarray, np.integer)) else [action]
+        lone = action[None] if isinstance(action, np.ndarray) else [action]
         try:
             actions = batch.checked_actions(lone)
         except ValueError:
@@ -136,7 +136,7 @@ class MemoryGymEnv(gym.Env):
         return self.batch.np_random[0]
 
     @_np_random.setter
-    def _np_random(self, rng: np.random.Generator) -> None:
+    def _np_random(self, rng: np.random.Generator | None) -> None:
         self.batch.set_generator(0, rng)
 
     @property

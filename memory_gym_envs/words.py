@@ -5,6 +5,7 @@ A word has 32 bits. `words` draws one at a time, `WordBuffer` reads many ahead.
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +46,7 @@ class WordBuffer:
     def __init__(self, rng: np.random.Generator, count: int):
         """Reads at least so many words."""
         self.source = rng.bit_generator
-        self.state = self.source.state
+        self.state: Any = self.source.state
         if "has_uint32" not in self.state:
             raise ValueError(f"levels need a generator of 64-bit numbers, as PCG64, not {type(self.source).__name__}")
         self.used = 1 - self.state["has_uint32"]
