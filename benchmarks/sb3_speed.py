@@ -3,7 +3,8 @@
     python benchmarks/sb3_speed.py [--id ID] [--obs-type pixels|vector] [--num-envs N] [--steps S]
 
 Prints two lines: random actions, and a training of sb3-contrib's RecurrentPPO of so many steps, whose network takes
-its part of the time. Both run on one thread; random actions take turns, and the best of each counts. Needs the extra `sb3` and sb3-contrib.
+its part of the time. Both run on one thread; with random actions they take turns, and the best of each counts. Needs
+the extra `sb3` and sb3-contrib.
 """
 
 import argparse

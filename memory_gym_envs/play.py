@@ -1,6 +1,6 @@
 """Play an environment with the keyboard.
 
-    python -m memory_gym_envs.play ID [--seed N] [--debug]
+    python -m memory_gym_envs.play ID [--seed N] [--options JSON] [--debug]
 
 WASD or the arrows move, R restarts, Page Up and Page Down change the seed, Escape quits. The first move starts the
 clock. Shows what the agent sees, or the debug view. Needs pygame, the extra `play`. Gymnasium's own `play` can neither
@@ -9,6 +9,7 @@ restart nor change the seed, and begins the next episode before one has seen how
 
 import argparse
 import difflib
+import json
 import os
 import sys
 import textwrap
@@ -42,12 +43,13 @@ PATH_ACTIONS = {RIGHT: 1, UP: 2, DOWN: 3}  # of the endless Mystery Path
 class Game:
     """An environment, the keys that are down, and what there is to tell about the episode.
 
-    Raises ValueError for a seed below 0.
+    Raises ValueError for a seed below 0, and for wrong options.
     """
 
-    def __init__(self, env_id: str, seed: int, debug: bool):
+    def __init__(self, env_id: str, seed: int, debug: bool, options: dict[str, Any] | None = None):
         self.env_id = env_id
-        env = gym.make(env_id, render_mode="debug_rgb_array" if debug else "rgb_array").unwrapped
+        mode = "debug_rgb_array" if debug else "rgb_array"
+        env = gym.make(f"memory_gym_envs/{env_id}", render_mode=mode, options=options).unwrapped
         assert isinstance(env, MemoryGymEnv)
         self.env = env
         self.held: list[str] = []  # directions, the last pressed last
@@ -153,23 +155,34 @@ def run(game: Game) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Plays what the command line says. Exits with one line for a wrong id, without pygame, and without a display."""
+    """Plays what the command line says. Exits with one line for wrong arguments, without pygame or a display."""
     parser = argparse.ArgumentParser(prog="python -m memory_gym_envs.play", description=HELP)
     parser.add_argument("id", help=", ".join(IDS))
     parser.add_argument("--seed", type=int, default=0, help="the level (default: 0)")
+    parser.add_argument("--options", default="{}", help="""reset parameters, as '{"agent_scale": 0.3}'""")
     parser.add_argument("--debug", action="store_true", help="show the debug view, with the ground truth")
     args = parser.parse_args(arguments)
+    args.id = args.id.removeprefix("memory_gym_envs/")
     if args.id not in IDS:
         (near,) = difflib.get_close_matches(args.id, IDS, n=1, cutoff=0.0)
         sys.exit(f"there is no id {args.id!r}; the nearest is {near}, and all are {', '.join(IDS)}")
     if args.seed < 0:
         sys.exit(f"--seed must be at least 0, not {args.seed}")
+    try:
+        game = Game(args.id, args.seed, args.debug, json.loads(args.options))
+    except json.JSONDecodeError as error:
+        sys.exit(f"--options is no JSON ({error}): {args.options}")
+    except ValueError as error:
+        sys.exit(f"--options: {error}")
     if pygame is None:
-        sys.exit('playing needs pygame: pip install -e ".[play]"')
+        sys.exit("playing needs pygame: pip install pygame-ce")
     try:
         pygame.display.init()
+        # Without a display, SDL draws where nobody sees it, and the program would wait for keys for ever.
+        if pygame.display.get_driver() in ("dummy", "offscreen") and "SDL_VIDEODRIVER" not in os.environ:
+            sys.exit("no window can be opened: there is no display")
         pygame.font.init()
-        run(Game(args.id, args.seed, args.debug))
+        run(game)
     except pygame.error as error:
         sys.exit(f"no window can be opened: {error}")
     finally:

@@ -1,5 +1,6 @@
 """The play program under SDL's dummy driver: keys that are posted move the agent, and the window shows what happens."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -202,10 +203,11 @@ def test_program_plays_until_the_window_is_closed(pygame, monkeypatch):
 
     monkeypatch.setattr(play, "show", show_and_stop)
     pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_a))
-    play.main(["MysteryPath-v0", "--seed", "3", "--debug"])
+    play.main(["MysteryPath-v0", "--seed", "3", "--debug", "--options", '{"max_steps": 6}'])
     assert games[-1].steps == 5
     assert games[-1].seed == 3
     assert games[-1].env.render_mode == "debug_rgb_array"
+    assert games[-1].env.batch.settings[0]["max_steps"] == 6
     fresh = Game("MysteryPath-v0", 3, debug=False)
     for _ in range(5):
         fresh.env.step([1, 0])
@@ -223,7 +225,11 @@ def test_program_plays_until_the_window_is_closed(pygame, monkeypatch):
             "there is no id 'MysteryPth-v0'; the nearest is MysteryPath-v0, and all are MortarMayhem-v0,",
         ),
         (["MysteryPath-v0", "--seed", "-1"], "--seed must be at least 0, not -1"),
-        (["MysteryPath-v0"], 'playing needs pygame: pip install -e ".[play]"'),
+        (["MysteryPath-v0", "--options", "{"], "--options is no JSON (Expecting property name"),
+        (["MysteryPath-v0", "--options", "[3]"], "--options: MysteryPath-v0: options must be a dictionary or None"),
+        (["MysteryPath-v0", "--options", '{"max_step": 3}'], "--options: MysteryPath-v0 has no option 'max_step'"),
+        (["MysteryPath-v0"], "playing needs pygame: pip install pygame-ce"),
+        (["memory_gym_envs/MysteryPath-v0"], "playing needs pygame: pip install pygame-ce"),
     ],
 )
 def test_one_clear_line(arguments, message):
@@ -233,3 +239,15 @@ def test_one_clear_line(arguments, message):
     assert result.returncode == 1
     assert result.stderr.startswith(message)
     assert result.stderr.count("\n") == 1
+
+
+def test_without_a_display_it_ends():
+    pytest.importorskip("pygame")
+    hidden = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    environ = {name: value for name, value in os.environ.items() if name not in hidden}
+    command = [sys.executable, "-m", "memory_gym_envs.play", "MysteryPath-v0"]
+    folder = Path(memory_gym_envs.__file__).parents[1]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environ, timeout=60, check=False)
+    assert result.returncode == 1
+    # Libraries that looked for a display may have said something before.
+    assert result.stderr.splitlines()[-1].startswith("no window can be opened: ")
