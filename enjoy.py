@@ -314,7 +314,7 @@ def video_data(name: str, video: Video) -> dict[str, Any]:
 def branch_names(env_id: str, branches: list[np.ndarray]) -> dict[str, list[str]]:
     """Name the action branches and their actions: in words for Memory Gym, else by numbers."""
     sizes = [len(branch) for branch in branches]
-    if is_memory_gym(env_id):
+    if family_of(env_id):
         return FREE if sizes == [3, 3] else ENDLESS_PATH if "Endless" in env_id else GRID
     names = ["action"] if len(sizes) == 1 else [f"branch {i + 1}" for i in range(len(sizes))]
     return {name: [str(action) for action in range(size)] for name, size in zip(names, sizes, strict=True)}

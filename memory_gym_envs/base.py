@@ -63,7 +63,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
     variants: ClassVar[Mapping[str, Any]] = {}
-    tables: ClassVar[tuple[str, ...]] = ("_agent_tables",)  # attributes that place_tables() makes, too large to pickle
+    tables: ClassVar[tuple[str, ...]] = ()  # attributes that place_tables() makes, too large to pickle
     growing: ClassVar[tuple[str, ...]] = ()  # arrays of `state` that are widened along their last axis when needed
     truth_high: ClassVar[float] = 1.0  # the ground truth's largest value; the least is 0
     kept: ClassVar[tuple[str, ...]] = ("ready", "settings", "_rngs", "_level_rngs", "_seeds", "_over")
@@ -108,7 +108,8 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._action_shape = (self.num_envs, *(self.single_action_space.shape or ()))
-        self._action_count = _choices(self.single_action_space)
+        space: Any = self.single_action_space
+        self._choices = np.array(space.nvec if hasattr(space, "nvec") else space.n, np.uint64)  # of each branch
         self._rngs: list[Any] = [None] * self.num_envs  # generators, from the first reset on
         self._level_rngs: list[Any] = [None] * self.num_envs  # likewise, with num_levels
         self._seeds: list[int | None] = [None] * self.num_envs
@@ -134,11 +135,9 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
 
     def configure(self, lanes: np.ndarray) -> None:
         """Takes over `self.settings` of the lanes, whose options were just set by an explicit reset."""
-        raise NotImplementedError
 
     def place_tables(self) -> None:
         """Looks up the tables that follow from the options, and where each lane's rows start in them."""
-        raise NotImplementedError
 
     def begin(self, lanes: np.ndarray) -> None:
         """Builds the lanes' next levels, each from its generator in `self.np_random`, and starts their episodes."""
@@ -170,7 +169,6 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Draws the lane's ground truth over its magnified frame, in place."""
-        raise NotImplementedError
 
     # ---- Gymnasium's interface ----
 
@@ -350,9 +348,10 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         if array.shape == self._action_shape and array.dtype.kind in "iu":
             array = array.astype(np.int64, copy=False)
             # Negative numbers are huge as unsigned ones, so one comparison checks both ends.
-            if not np.count_nonzero(array.view(np.uint64) >= self._action_count):
+            if not np.count_nonzero(array.view(np.uint64) >= self._choices):
                 return array
-        limit = f"integers from 0 to {self._action_count - 1} of shape {self._action_shape}"
+        highest = " or ".join(map(str, np.unique(self._choices).astype(int) - 1))
+        limit = f"integers from 0 to {highest} of shape {self._action_shape}"
         raise ValueError(f"{self.variant_id}: actions must be {limit}, not {brief(actions)}")
 
     def _split_mask(self, options: Mapping[str, Any] | None) -> tuple[np.ndarray, Mapping[str, Any] | None]:
@@ -408,14 +407,6 @@ def widened(array: np.ndarray, width: int, filler: float = 0) -> np.ndarray:
     if missing <= 0:
         return array
     return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, missing)], constant_values=filler)
-
-
-def _choices(space: gym.Space) -> int:
-    """How many values an action has: the families' branches are all equally wide."""
-    if isinstance(space, gym.spaces.MultiDiscrete):
-        return int(space.nvec[0])
-    assert isinstance(space, gym.spaces.Discrete)
-    return int(space.n)
 
 
 def lane_seeds(seed: Any, num_envs: int) -> list[int | None]:

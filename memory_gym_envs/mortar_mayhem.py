@@ -560,7 +560,7 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     variants = VARIANTS
     growing = ("commands", "clue")
-    tables = (*MemoryGymVectorEnv.tables, "_appearance")
+    tables = ("_agent_tables", "_appearance")
     kept = (*MemoryGymVectorEnv.kept, "_clues_open")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:

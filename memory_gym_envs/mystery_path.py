@@ -860,7 +860,7 @@ class MysteryPath(MemoryGymVectorEnv):
     """
 
     variants = VARIANTS
-    tables = (*MemoryGymVectorEnv.tables, "_appearance")
+    tables = ("_agent_tables", "_appearance")
     growing = (*PATH_ARRAYS, *MAP_ARRAYS, "trail_lane", "trail_x", "trail_y")
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:

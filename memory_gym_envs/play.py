@@ -84,7 +84,7 @@ class Game:
         if isinstance(self.env.action_space, gym.spaces.MultiDiscrete):
             axes = ((LEFT, RIGHT), (UP, DOWN))
             return np.array([(back in ways) + 2 * (forth in ways) for back, forth in axes]) % 3
-        actions = GRID_ACTIONS if self.env.batch.variant.grid else PATH_ACTIONS
+        actions = GRID_ACTIONS if getattr(self.env.batch.variant, "grid", False) else PATH_ACTIONS
         return next((actions[way] for way in reversed(ways) if way in actions), 0)
 
     def step(self) -> None:

@@ -27,10 +27,10 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformAction
 from torch import Tensor
 
 import memory_gym_envs  # noqa: F401 (registers its ids)
-from memory_gym_envs.base import checked_integer
+from memory_gym_envs.base import MemoryGymVectorEnv, checked_integer
 from memory_gym_envs.options import brief
 from memory_gym_envs.saving import Saved
-from ppo_utils.lanes import OWN, Levels, one_line, one_line_errors, same_step_envs
+from ppo_utils.lanes import OWN, Levels, creator, one_line, one_line_errors, same_step_envs
 from ppo_utils.observations import ObservationParts
 from ppo_utils.processes import RunError, rank_and_size
 from ppo_utils.wrappers import (
@@ -297,8 +297,12 @@ def find_spec(env_id: str) -> EnvSpec:
 
 
 def is_memory_gym(env_id: str) -> bool:
-    """Return whether the id is one of this package's environments, which have levels and reset parameters."""
-    return str(find_spec(env_id).entry_point).startswith("memory_gym_envs")
+    """Return whether the id is one of a `MemoryGymVectorEnv`, which has levels, reset parameters and vectors."""
+    try:
+        made = creator(find_spec(env_id).vector_entry_point or "")
+    except (ImportError, ValueError):  # of a package that needs more than is installed; no entry point
+        return False
+    return isinstance(made, type) and issubclass(made, MemoryGymVectorEnv)
 
 
 def json_object(flag: str, text: str) -> dict[str, Any]:
