@@ -196,7 +196,9 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             raise gym.error.ResetNeeded("call reset() before step()")
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             return self._step_and_wait(self.checked_actions(actions))
-        rewards, terminated, truncated = self._advance(self.checked_actions(actions))
+        rewards, terminated, truncated = self.advance(self.checked_actions(actions))
+        if self.max_episode_steps is not None:
+            truncated = self._limit(truncated)
         observations, infos = self.observe(ALL), {}
         (ended,) = (terminated | truncated).nonzero()
         if ended.size:
@@ -293,27 +295,24 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         self._next_levels(lanes, seeds)
         self.ready = True
 
-    def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """One step of the rules, which `max_episode_steps` may end: like Gymnasium's TimeLimit, whatever else does."""
-        rewards, terminated, truncated = self.advance(actions)
-        if self.max_episode_steps is not None:
-            truncated = truncated | (self.state.length >= self.max_episode_steps)
-        return rewards, terminated, truncated
+    def _limit(self, truncated: np.ndarray) -> np.ndarray:
+        """(N,) truncated by `max_episode_steps` too: as Gymnasium's TimeLimit, whether or not they are terminated."""
+        return truncated | (self.state.length >= self.max_episode_steps)
 
     def _step_and_wait(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One step in which lanes that wait since the last one are reset, or have to have been, and others begin to."""
         waiting = np.flatnonzero(self._over)
         if waiting.size and self.autoreset_mode is AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(f"the episodes of lanes {waiting.tolist()} are over: reset them by reset_mask")
-        if not waiting.size:
-            rewards, terminated, truncated = self._advance(actions)
-        else:
+        rngs = self._rngs
+        if waiting.size:
             # All lanes advance at once. These do it in a level that nobody sees, by generators that nobody needs.
-            rngs, self._rngs = self._rngs, [*self._rngs]
-            for lane in waiting.tolist():
-                self._rngs[lane] = np.random.default_rng(0)
+            self._rngs = [np.random.default_rng(0) if over else rng for over, rng in zip(self._over, rngs, strict=True)]
             self.begin(waiting)
-            rewards, terminated, truncated = self._advance(actions)
+        rewards, terminated, truncated = self.advance(actions)
+        if self.max_episode_steps is not None:
+            truncated = self._limit(truncated)
+        if waiting.size:
             self._rngs = rngs
             self._next_levels(waiting, [None] * self.num_envs)
             rewards[waiting], terminated[waiting], truncated[waiting] = 0.0, False, False
