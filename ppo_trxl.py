@@ -1165,11 +1165,11 @@ def make_optimizers(agent: Agent, args: Args) -> list[torch.optim.Optimizer]:
     outer = ("encoder.mlp.", "heads.policy.2.", "heads.value.2.", "decoder.", "estimator.")
     linear = {layer.weight for layer in agent.modules() if isinstance(layer, nn.Linear)}
     named = agent.named_parameters() if args.optimizer == "muon" else []
-    hidden = [weight for name, weight in named if weight in linear and not name.startswith(outer)]
-    others = [weight for weight in agent.parameters() if weight not in {*hidden}]
+    hidden = {weight: name for name, weight in named if weight in linear and not name.startswith(outer)}
+    others = [weight for weight in agent.parameters() if weight not in hidden]
     optimizers = [torch.optim.AdamW(others, lr=args.init_lr, fused=True)]
     if hidden:
-        optimizers.append(torch.optim.Muon(hidden, weight_decay=0.01, adjust_lr_fn="match_rms_adamw"))
+        optimizers.append(torch.optim.Muon([*hidden], weight_decay=0.01, adjust_lr_fn="match_rms_adamw"))
     return optimizers
 
 
