@@ -16,11 +16,12 @@ from memory_gym_envs.entries import Entries
 LARGEST_RADIUS = radius_of(1.0)
 UNSEEN = SPAN  # the position of an agent of which nothing shows, and its size
 # What entries say, by their code: stored positions, then UNSEEN, then sizes.
-SIZES = np.arange(1 + LARGEST_RADIUS) / LARGEST_RADIUS
-VALUES = np.concatenate([(np.arange(SPAN) - PAD) / SCREEN, SIZES]).astype(np.float32)
+BODY_SIZES = np.arange(1 + LARGEST_RADIUS) / LARGEST_RADIUS
+VALUES = np.concatenate([(np.arange(SPAN) - PAD) / SCREEN, BODY_SIZES]).astype(np.float32)
 FLAGS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little").astype(np.float32)
-NOTHING = (UNSEEN, UNSEEN, UNSEEN, 0)  # the codes
+HIDDEN = (UNSEEN, UNSEEN, UNSEEN, 0)  # the codes
 PLACE_STRIDES = np.array([1, SPAN])
+CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # (4, 2) of a square, in units of its width
 
 
 def agent_entries(low: int, high: int) -> tuple[Entries, ...]:
@@ -72,11 +73,11 @@ def appearance_codes(view: View) -> np.ndarray:
     size = np.full_like(count, UNSEEN + radius_of(view.scale))
     facings = np.packbits(same_look, axis=1, bitorder="little")
     codes = np.column_stack([size, column + view.columns.start, row + view.rows.start, facings]).astype(np.uint8)
-    codes[kind[hashes.reshape(-1) == 0]] = NOTHING
-    table = np.full((FACINGS, SPAN, SPAN, len(NOTHING)), NOTHING, np.uint8)
+    codes[kind[hashes.reshape(-1) == 0]] = HIDDEN
+    table = np.full((FACINGS, SPAN, SPAN, len(HIDDEN)), HIDDEN, np.uint8)
     reach = (slice(None), slice(view.rows.start, view.rows.stop), slice(view.columns.start, view.columns.stop))
-    table[reach] = codes[kind].reshape(*hashes.shape, len(NOTHING))
-    return table.reshape(-1, len(NOTHING))
+    table[reach] = codes[kind].reshape(*hashes.shape, len(HIDDEN))
+    return table.reshape(-1, len(HIDDEN))
 
 
 def appearance_hashes(view: View) -> np.ndarray:

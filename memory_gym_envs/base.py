@@ -17,13 +17,15 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from memory_gym_envs.drawing import magnify
+from memory_gym_envs.drawing import grayscale, magnify
 from memory_gym_envs.entries import vector_space
-from memory_gym_envs.options import brief, resolve
+from memory_gym_envs.options import brief, complete_options
 from memory_gym_envs.saving import Saved, plain, restored
+from memory_gym_envs.state import grows
+from memory_gym_envs.variant import Variant
 
 RENDER_MODES = ("rgb_array", "debug_rgb_array")
-OBS_TYPES = ("pixels", "vector")
+OBS_TYPES = ("pixels", "grayscale", "vector")
 DEBUG_ZOOM = 4  # the debug view is 336 x 336
 ALL = slice(None)  # every lane
 NO_LIMIT = np.iinfo(np.int64).max  # of steps
@@ -40,8 +42,9 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         num_levels: with n > 0, every reset without a seed, automatic ones too, plays a level sampled from n; None or 0:
             no limit. A level is what `reset(seed=level)` builds.
         start_level: the first of those n levels.
-        obs_type: "pixels" (the id's own observation space) or "vector": a flat (V,) float32 vector of what the frame
-            shows, and of nothing that it hides; no frame is drawn then. `variant.entries` says what is in it.
+        obs_type: "pixels" (the id's own observation space), "grayscale" (the same with pictures of one channel, their
+            luminance) or "vector": a flat (V,) float32 vector of what the frame shows, and of nothing that it hides; no
+            frame is drawn then. `variant.entries` says what is in it.
         options: reset parameters that are this environment's defaults, for resets that do not give them.
         autoreset_mode: when an episode that ends is reset: in the same step, in the next one, or by the caller.
         max_episode_steps: truncates longer episodes, as `gym.make(id, max_episode_steps=...)` does.
@@ -62,12 +65,11 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         "render_fps": 25,
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
-    variants: ClassVar[Mapping[str, Any]] = {}
+    variants: ClassVar[Mapping[str, Variant]] = {}
     tables: ClassVar[tuple[str, ...]] = ()  # attributes that place_tables() makes, too large to pickle
-    growing: ClassVar[tuple[str, ...]] = ()  # arrays of `state` that are widened along their last axis when needed
     truth_high: ClassVar[float] = 1.0  # the ground truth's largest value; the least is 0
     kept: ClassVar[tuple[str, ...]] = ("ready", "settings", "_rngs", "_level_rngs", "_seeds", "_over")
-    state: Any  # the family's State, a dataclass of arrays; saved besides what is `kept`
+    state: Any  # the family's State, a dataclass of `state.array`s; saved besides what is `kept`
 
     def __init__(
         self,
@@ -86,7 +88,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ValueError(f"render_mode must be None, {' or '.join(map(repr, RENDER_MODES))}, not {render_mode!r}")
         if obs_type not in OBS_TYPES:
-            raise ValueError(f"obs_type must be {' or '.join(map(repr, OBS_TYPES))}, not {obs_type!r}")
+            raise ValueError(f"obs_type must be one of {', '.join(map(repr, OBS_TYPES))}, not {obs_type!r}")
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -105,6 +107,8 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         self.single_observation_space, self.single_action_space = self.spaces()
         if obs_type == "vector":
             self.single_observation_space = vector_space(self.variant.entries)
+        elif obs_type == "grayscale":
+            self.single_observation_space = grayscale_space(self.single_observation_space)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._action_shape = (self.num_envs, *(self.single_action_space.shape or ()))
@@ -113,7 +117,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         self._rngs: list[Any] = [None] * self.num_envs  # generators, from the first reset on
         self._level_rngs: list[Any] = [None] * self.num_envs  # likewise, with num_levels
         self._seeds: list[int | None] = [None] * self.num_envs
-        self.defaults = resolve(self.variant.options, options, variant)
+        self.defaults = complete_options(self.variant.options, options, variant)
         self.settings = [self.defaults] * self.num_envs  # each lane's reset options, never changed in place
         names = ("num_envs", "num_levels", "start_level", "obs_type", "max_episode_steps")
         self.arguments = {"id": variant, **{name: getattr(self, name) for name in names}}
@@ -183,7 +187,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         """
         lanes, options = self._split_mask(options)
         seeds = lane_seeds(seed, self.num_envs)
-        self.restart(lanes, seeds, self.resolve(options))
+        self.restart(lanes, seeds, self.complete_options(options))
         return self.observe(ALL), self._truth_info(lanes)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -241,7 +245,10 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
 
     def observe(self, lanes: np.ndarray | slice) -> Any:
         """Fresh observations of the lanes, of the kind that the environment was made for."""
-        return self.vectors(lanes) if self.obs_type == "vector" else self.pixels(lanes)
+        if self.obs_type == "vector":
+            return self.vectors(lanes)
+        pixels = self.pixels(lanes)
+        return pixels if self.obs_type == "pixels" else grayscale_pictures(pixels)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name not in self.tables}
@@ -261,7 +268,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         """
         state = {"_over": np.zeros(self.num_envs, bool), **state}  # states of earlier versions are without
         self._check_state(state)
-        arrays, settings = restored(state["arrays"]), [self.resolve(each) for each in state["settings"]]
+        arrays, settings = restored(state["arrays"]), [self.complete_options(each) for each in state["settings"]]
         super().set_state({**state, "settings": settings})
         self.configure(np.arange(self.num_envs))  # for what follows from the options of all lanes
         self.state = type(self.state)(**arrays)
@@ -273,18 +280,18 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         if arrays.keys() != vars(self.state).keys():
             raise ValueError(f"the saved state is of another version of {self.variant_id}")
         for name, ours in vars(self.state).items():
-            fixed, shape = slice(ours.ndim - (name in self.growing)), arrays[name].shape
+            fixed, shape = slice(ours.ndim - grows(self.state, name)), arrays[name].shape
             if len(shape) != ours.ndim or shape[fixed] != ours.shape[fixed]:
                 raise ValueError(f"its array {name} has the shape {shape}, not {ours.shape}")
         for name in ("settings", "_rngs", "_level_rngs", "_seeds", "_over"):
             if len(state[name]) != self.num_envs:
                 raise ValueError(f"its {name} are of {len(state[name])} lanes, not of {self.num_envs}")
 
-    def resolve(self, options: Mapping[str, Any] | None) -> dict[str, Any]:
+    def complete_options(self, options: Mapping[str, Any] | None) -> dict[str, Any]:
         """The complete reset options. Raises ValueError for a wrong one."""
         if options is None:
             return self.defaults
-        return resolve(self.variant.options, options, self.variant_id, self.defaults)
+        return complete_options(self.variant.options, options, self.variant_id, self.defaults)
 
     def restart(self, lanes: np.ndarray, seeds: list[int | None], settings: dict[str, Any]) -> None:
         """An explicit reset of the lanes with these checked seeds (one for every lane of N) and options."""
@@ -408,6 +415,11 @@ def widened(array: np.ndarray, width: int, filler: float = 0) -> np.ndarray:
     return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, missing)], constant_values=filler)
 
 
+def limit_of(steps: int) -> int:
+    """The number of steps that an option allows, of which -1 means any."""
+    return NO_LIMIT if steps == -1 else steps
+
+
 def lane_seeds(seed: Any, num_envs: int) -> list[int | None]:
     """Each lane's seed, as Gymnasium's vector environments have it: of an integer, lane i has seed + i.
 
@@ -448,6 +460,22 @@ def one_of(observations: Any, lane: int) -> Any:
     if isinstance(observations, dict):
         return {key: values[lane].copy() for key, values in observations.items()}
     return observations[lane].copy()
+
+
+def grayscale_space(space: gym.Space) -> gym.Space:
+    """The space with one channel instead of three in each picture."""
+    if isinstance(space, gym.spaces.Dict):
+        return gym.spaces.Dict({key: grayscale_space(each) for key, each in space.items()})
+    if space.dtype != np.uint8:
+        return space
+    return gym.spaces.Box(0, 255, (*space.shape[:2], 1), np.uint8)  # type: ignore[index]
+
+
+def grayscale_pictures(observations: Any) -> Any:
+    """The observations with one channel instead of three in each picture."""
+    if isinstance(observations, dict):
+        return {key: grayscale_pictures(each) for key, each in observations.items()}
+    return grayscale(observations) if observations.dtype == np.uint8 else observations
 
 
 def overwrite(observations: Any, lanes: np.ndarray, fresh: Any) -> None:

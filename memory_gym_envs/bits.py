@@ -17,12 +17,12 @@ ITEM = 12
 ITEMS = SCREEN // ITEM
 TILES = SCREEN // 12
 MASK = SCREEN * ITEMS  # items of a mask
-STEP = 2
-LINES = SCREEN // STEP  # words of a sample
-LINE = np.uint64((1 << 8 * ITEMS) - 1)  # all bits of one
+SAMPLE_STEP = 2
+SAMPLE_ROWS = SCREEN // SAMPLE_STEP  # words of a sample
+FULL_ROW = np.uint64((1 << 8 * ITEMS) - 1)  # all bits of one
 SAMPLED = np.array([0, 1, 3, 4, 6, 7, 9, 10])  # which of 12 pixels are
 PLACES, PLACE_0 = 256, 64  # shapes are at -64 .. 191 on both axes
-NOTHING = np.zeros((0, 0), bool)
+NO_SHAPE = np.zeros((0, 0), bool)
 
 
 class Stencils(NamedTuple):
@@ -48,7 +48,7 @@ def stencils(shapes: Sequence[np.ndarray], height: int = SCREEN) -> Stencils:
 
 def samples(shapes: Sequence[np.ndarray]) -> Stencils:
     """Samples of (W, W) shapes, W even."""
-    return _stencils(shapes, _sampled, STEP, LINES)
+    return _stencils(shapes, _sampled, SAMPLE_STEP, SAMPLE_ROWS)
 
 
 def _stencils(shapes: Sequence[np.ndarray], pack: Callable, step: int, height: int) -> Stencils:
@@ -66,7 +66,7 @@ def _stencils(shapes: Sequence[np.ndarray], pack: Callable, step: int, height: i
             column[index, seen] = end + step * part[index] * (first[index, seen] + len(shape) - 1)
             strip.append(_every_x(shape, pack, step, height))
             end += len(strip[-1])
-    return Stencils(windows(np.concatenate(strip), height), column.reshape(-1), row.reshape(-1))
+    return Stencils(row_windows(np.concatenate(strip), height), column.reshape(-1), row.reshape(-1))
 
 
 def _every_x(shape: np.ndarray, pack: Callable, step: int, height: int) -> np.ndarray:
@@ -90,7 +90,7 @@ def unpacked(items: np.ndarray) -> np.ndarray:
 
 def sample(pixels: np.ndarray) -> np.ndarray:
     """The sample of a frame's pixels (84, 84) bool: (42,) uint64."""
-    return _sampled(pixels[::STEP])[:, 0]
+    return _sampled(pixels[::SAMPLE_STEP])[:, 0]
 
 
 def _sampled(pixels: np.ndarray) -> np.ndarray:
@@ -102,7 +102,7 @@ def _sampled(pixels: np.ndarray) -> np.ndarray:
     return words_.view(np.uint64)
 
 
-def windows(strip: np.ndarray, height: int) -> np.ndarray:
+def row_windows(strip: np.ndarray, height: int) -> np.ndarray:
     """Every window of so many rows of a strip (rows, items), by its first row: one opaque item each, a view."""
     size = strip.shape[1] * strip.itemsize
     return np.ndarray((len(strip) - height + 1,), np.dtype(f"V{size * height}"), strip, 0, (size,))
@@ -140,19 +140,19 @@ def tile_counts(lines: np.ndarray) -> np.ndarray:
     return sums_[..., :TILES].reshape(len(lines), -1)
 
 
-_X, _Y = (ITEM * np.arange(ITEMS)[:, None] + SAMPLED).reshape(-1), STEP * np.arange(LINES)
+_X, _Y = (ITEM * np.arange(ITEMS)[:, None] + SAMPLED).reshape(-1), SAMPLE_STEP * np.arange(SAMPLE_ROWS)
 _DIGITS = SCREEN.bit_length()  # of an x
 # A word's pixels whose x has this binary digit; first all of them: (1 + _DIGITS, 1) uint64.
 _PLANES = np.stack(
-    [LINE]
+    [FULL_ROW]
     + [
         np.bitwise_or.reduce((_X >> digit & 1).astype(np.uint64) << np.arange(56, dtype=np.uint64))
         for digit in range(_DIGITS)
     ]
 )[:, None]
 # (8 * 42, 3) float32: what their counts add to the number of pixels and to the sums of x and of y.
-_MOMENTS: np.ndarray = np.zeros((1 + _DIGITS, LINES, 3), np.float32)
-_MOMENTS[0] = np.stack([np.ones(LINES), np.full(LINES, 0.5), _Y + 0.5], axis=1)
+_MOMENTS: np.ndarray = np.zeros((1 + _DIGITS, SAMPLE_ROWS, 3), np.float32)
+_MOMENTS[0] = np.stack([np.ones(SAMPLE_ROWS), np.full(SAMPLE_ROWS, 0.5), _Y + 0.5], axis=1)
 _MOMENTS[1:, :, 1] = 1 << np.arange(_DIGITS)[:, None]
 _MOMENTS = _MOMENTS.reshape(-1, 3)
 

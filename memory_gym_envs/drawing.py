@@ -11,6 +11,8 @@ SCREEN = 84  # width and height of an observation in pixels
 ROW = 3 * SCREEN  # bytes in a row of a frame
 FRAME = SCREEN * ROW  # bytes in a frame
 FEW = 4  # sprites that are pasted faster one by one
+WHITE, RED, GREEN, BLUE = (255, 255, 255), (255, 0, 0), (0, 255, 0), (0, 0, 255)
+LUMINANCE = np.array([299, 587, 114])  # of red, green and blue, in thousandths (ITU-R BT.601)
 
 
 def disk(size: int, x: float, y: float, radius: int) -> np.ndarray:
@@ -108,8 +110,8 @@ def make_sheet(sprites: np.ndarray, solid: np.ndarray, positions: np.ndarray) ->
     return Sheet(
         row,
         canvas,
-        windows(keep, canvas, row),
-        windows(ink, canvas, row),
+        squares_of(keep, canvas, row),
+        squares_of(ink, canvas, row),
         (keep, ink),
         (frame_start[:, None] * SCREEN + frame_start).reshape(-1),
         (source[:, None] * canvas + source).reshape(-1),
@@ -132,7 +134,7 @@ def paste(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, o
     place = pos.dot(sheet.strides)  # (n,)
     start = sheet.frame_start.take(place) + first
     source = sheet.canvas_start.take(place) + rows * (sheet.canvas * sheet.canvas)
-    squares = windows(frames, SCREEN, sheet.row)  # a square never leaves its frame, as frame_start is clipped
+    squares = squares_of(frames, SCREEN, sheet.row)  # a square never leaves its frame, as frame_start is clipped
     patch = squares[start]  # (n, W) rows
     pixels = patch.view(np.uint8)  # (n, W * W * 3), the same memory
     pixels &= sheet.keep[source].view(np.uint8)
@@ -158,11 +160,11 @@ def stamp(frames: np.ndarray, picture: np.ndarray, owner: np.ndarray, x: np.ndar
     frames: (n, FRAME) uint8, contiguous, changed in place. owner, x, y: (m,). All of it must be on the screen.
     """
     row = np.dtype(f"V{3 * len(picture)}")
-    squares = windows(frames, SCREEN, row)
+    squares = squares_of(frames, SCREEN, row)
     squares[(owner * SCREEN + y) * SCREEN + x] = picture.reshape(len(picture), -1).view(row)[:, 0]  # (W,) rows
 
 
-def windows(images: np.ndarray, across: int, row: np.dtype) -> np.ndarray:
+def squares_of(images: np.ndarray, across: int, row: np.dtype) -> np.ndarray:
     """Every W x W square of a contiguous stack of images, by its first pixel: (starts, W) rows, a view.
 
     images: uint8 of any shape, in memory a stack of (across, across, 3).
@@ -170,6 +172,17 @@ def windows(images: np.ndarray, across: int, row: np.dtype) -> np.ndarray:
     width = row.itemsize // 3
     starts = images.size // 3 - (width - 1) * (across + 1)
     return np.ndarray((starts, width), row, images, 0, (3, 3 * across))
+
+
+def grayscale(frames: np.ndarray) -> np.ndarray:
+    """The luminance of frames (..., 3), rounded: (..., 1) uint8."""
+    return ((frames @ LUMINANCE + 500) // 1000).astype(np.uint8)[..., None]
+
+
+def read_only(table: np.ndarray) -> np.ndarray:
+    """The table, which can no longer be written to, since many environments share it."""
+    table.flags.writeable = False
+    return table
 
 
 def magnify(frame: np.ndarray, factor: int) -> np.ndarray:

@@ -40,7 +40,7 @@ from memory_gym_envs.options import Option
 from memory_gym_envs.words import below, pick, words
 
 TILE = 14  # pixels
-SIZES = range(2, 7)  # tiles along one side of the arena
+ARENA_SIZES = range(2, 7)  # tiles along one side of the arena
 TORUS_SIZE = 6  # fills the screen
 
 # In the original's order: allowed_commands=k allows the first k.
@@ -78,7 +78,10 @@ def _options(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
         (endless, Option("max_steps", -1, "int", 1, None, "steps until truncation; -1: no limit", also=(-1,))),
         (True, Option("agent_scale", 0.25, "float", 0.04, 1.0, size + note)),
         (not grid, Option("agent_speed", 3.0, "float", 0.0, 84.0, "pixels that the agent walks in a step")),
-        (not endless, Option("arena_size", 5, "int", SIZES[0], SIZES[-1], "tiles along one side of the arena")),
+        (
+            not endless,
+            Option("arena_size", 5, "int", ARENA_SIZES[0], ARENA_SIZES[-1], "tiles along one side of the arena"),
+        ),
         (True, Option("allowed_commands", 5 if grid else 9, "int", 4, 9, "how many kinds of command may occur")),
         (not endless, Option("command_count", (10,), "ints", 1, 100 if clue else VECTOR_COMMANDS, "commands to do *")),
         (endless, Option("initial_command_count", 1, "int", 1, 100, "commands in the first sequence")),
@@ -101,7 +104,7 @@ def _entries(clue: bool, endless: bool) -> tuple[Entries, ...]:
     around = LARGEST_RADIUS // 2 + 1 if endless else 0  # how far beyond the screen's edge an agent may be
     return (
         *agent_entries(-around, SCREEN + around),
-        Entries("arena", 1, f"tiles along one side of the arena, / {SIZES[-1]}; 0: an agent hides all of it"),
+        Entries("arena", 1, f"tiles along one side of the arena, / {ARENA_SIZES[-1]}; 0: an agent hides all of it"),
         Entries("fire", 1, "1: tiles burn, and it shows"),
         Entries("safe", 2, "the centre of the tile that does not burn, x and y, / 84 pixels; zeros: none, or hidden"),
         Entries("command", len(COMMANDS), command) if clue else Entries("commands", VECTOR_COMMANDS * 9, rest),
@@ -279,7 +282,7 @@ SYMBOL, SYMBOL_AT = 24, 31  # width of the symbols' square, and its first pixel 
 
 
 # The rows of floors(): every arena in blue, and then burning around each tile. Such a row stands for that tile, too.
-FLOORS = [(size, tile) for size in SIZES for tile in (None, *((x, y) for x in range(size) for y in range(size)))]
+FLOORS = [(size, tile) for size in ARENA_SIZES for tile in (None, *((x, y) for x in range(size) for y in range(size)))]
 
 
 @cache
@@ -366,7 +369,7 @@ CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # (4, 2)
 @cache
 def floor_entries() -> np.ndarray:
     """(F, 4) float32: arena, fire and safe tile, for every row of floors()."""
-    size, fire = np.array([(size / SIZES[-1], tile is not None) for size, tile in FLOORS]).T
+    size, fire = np.array([(size / ARENA_SIZES[-1], tile is not None) for size, tile in FLOORS]).T
     safe = (tile_tables().corner - PAD + TILE // 2) / SCREEN * fire[:, None]
     return np.column_stack([size, fire, safe]).astype(np.float32)
 

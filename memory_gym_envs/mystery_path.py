@@ -434,9 +434,9 @@ def forget_trails(s: State, lanes: np.ndarray) -> None:
 WHITE, GREY, ICE = (255, 255, 255), (210, 210, 210), (125, 177, 250)
 BLUE, GREEN, RED = (0, 0, 255), (0, 255, 0), (255, 0, 0)
 CROSS = 10  # width of the cross
-BAR = 4  # width of the stamina bar
-STEP, ORIGIN, GOAL, WALL, EDGE = range(5)  # rows of tiles()
-BACK = np.arange(1, (2 * SIDE - 1) * SIDE + 1)  # steps back that can be drawn: those on less than two segments
+STAMINA_BAR = 4  # width of the stamina bar
+ON_PATH, ORIGIN, GOAL, WALL, EDGE = range(5)  # rows of tiles()
+STEPS_BACK = np.arange(1, (2 * SIDE - 1) * SIDE + 1)  # steps back that can be drawn: those on less than two segments
 
 
 @cache
@@ -481,10 +481,10 @@ def grounds() -> np.ndarray:
 
 @cache
 def bars() -> np.ndarray:
-    """(SCREEN + 1, SCREEN, 3 * BAR) uint8, read-only: the stamina bar, green below so many red rows."""
-    table = np.tile(np.array(GREEN, np.uint8), (SCREEN + 1, SCREEN, BAR, 1))
+    """(SCREEN + 1, SCREEN, 3 * STAMINA_BAR) uint8, read-only: the stamina bar, green below so many red rows."""
+    table = np.tile(np.array(GREEN, np.uint8), (SCREEN + 1, SCREEN, STAMINA_BAR, 1))
     table[np.arange(SCREEN + 1)[:, None] > np.arange(SCREEN)] = RED
-    table = table.reshape(SCREEN + 1, SCREEN, 3 * BAR)
+    table = table.reshape(SCREEN + 1, SCREEN, 3 * STAMINA_BAR)
     table.flags.writeable = False
     return table
 
@@ -535,7 +535,7 @@ def ground_rows(s: State, lanes: np.ndarray | slice) -> np.ndarray:
 
 # The picture of a past tile by its first pixel, counted from the end if negative. Where just two of its columns are on
 # the screen, the original paints both like its border.
-TRAIL_KIND = np.full(SCREEN + TILE, STEP)
+TRAIL_KIND = np.full(SCREEN + TILE, ON_PATH)
 TRAIL_KIND[[2 - TILE, SCREEN - 2]] = EDGE
 
 
@@ -588,7 +588,7 @@ def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: np.ndarray | s
     paste(frames, sheet, s.figure[lanes] * FACINGS + s.facing[lanes], pos)
     if extras:
         shown = s.show_stamina[lanes]
-        frames.reshape(-1, SCREEN, ROW)[shown, :, -3 * BAR :] = bars()[spent_stamina(s, lanes)[shown]]
+        frames.reshape(-1, SCREEN, ROW)[shown, :, -3 * STAMINA_BAR :] = bars()[spent_stamina(s, lanes)[shown]]
     (which,) = s.shows_cross[lanes].nonzero()
     if which.size:
         cross = pos[which]
@@ -659,7 +659,7 @@ def write_trail(out: np.ndarray, s: State, lanes: np.ndarray | slice, tables: Ap
     inset, width = 0, SCREEN
     if np.count_nonzero(s.extras[lanes]):
         # The background has the same borders, which may be two columns wide, but not the pixels inside them.
-        inset, width = 2 * s.show_ground[lanes][owner], (SCREEN - BAR * s.show_stamina[lanes])[owner]  # (m,)
+        inset, width = 2 * s.show_ground[lanes][owner], (SCREEN - STAMINA_BAR * s.show_stamina[lanes])[owner]  # (m,)
     shown = (x + inset < width) & (x + (TILE - 1) - inset >= 0)
     cut = x == 1 - TILE  # all but its last pixels, in the screen's first column
     if np.count_nonzero(cut):
@@ -730,7 +730,7 @@ def trail(s: State, lanes: np.ndarray, lane_path: np.ndarray) -> tuple[np.ndarra
     at = s.last_path_step.take(lanes)
     first_column = np.maximum(s.tile[:, 0] - s.trail_columns, 1).take(lanes)  # (n,)
     bound = first_column * ROWS  # cells below that are far enough left
-    back = BACK[: int(at.max())]  # (K,)
+    back = STEPS_BACK[: int(at.max())]  # (K,)
     # What is before the pit is of another lane, but nobody gets there: the pit's cell is left of everything.
     cells = s.path_cell.take((at + lane_path.take(lanes))[:, None] - back)  # (n, K)
     count = (cells < bound[:, None]).argmax(axis=1) + 1  # (n,)
@@ -904,7 +904,9 @@ class MysteryPath(MemoryGymVectorEnv):
         s.speed[lanes] = speed
         s.ground_period[lanes] = speed * math.ceil(TILE / speed) if speed else 1
         s.figure_x[lanes], s.cross_x[lanes] = camera_columns(values)
-        s.cross_fits[lanes] = camera_columns(values)[1] < PAD + SCREEN - BAR * values["show_stamina"] + CROSS // 2
+        s.cross_fits[lanes] = (
+            camera_columns(values)[1] < PAD + SCREEN - STAMINA_BAR * values["show_stamina"] + CROSS // 2
+        )
 
     def _figure(self, values: dict[str, Any]) -> Figure:
         if self.variant.grid:
@@ -917,7 +919,7 @@ class MysteryPath(MemoryGymVectorEnv):
         if not self.variant.endless:
             return ViewOptions(scale, None, 0, SCREEN)
         figure_x, cross_x = camera_columns(values)
-        return ViewOptions(scale, figure_x, cross_x - figure_x, SCREEN - BAR * values["show_stamina"])
+        return ViewOptions(scale, figure_x, cross_x - figure_x, SCREEN - STAMINA_BAR * values["show_stamina"])
 
     def place_tables(self) -> None:
         """The flat tables that step() looks things up in, and where each lane's rows start in them."""
@@ -1062,7 +1064,7 @@ class MysteryPath(MemoryGymVectorEnv):
         small = draw_endless_ground(s, one) if endless else draw_ground(s, one)  # (1, FRAME)
         steps = int(s.path_length[lane])
         path = s.path_cell[lane, 1 : steps + 1].tolist()
-        marks = [(cell, ORIGIN if cell // ROWS % SEGMENT == SIDE else STEP) for cell in path]
+        marks = [(cell, ORIGIN if cell // ROWS % SEGMENT == SIDE else ON_PATH) for cell in path]
         marks[0] = (marks[0][0], ORIGIN)
         if not endless:
             marks[-1] = (marks[-1][0], GOAL)

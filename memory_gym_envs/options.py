@@ -1,7 +1,8 @@
 """Reset options: one table row each, checked before anything changes.
 
-A family lists its options as a tuple of `Option`. `resolve` turns what a caller passed to `reset` into a complete
-dictionary of plain Python values, or raises one `ValueError` that says which option is wrong and what would be right.
+A family lists its options as a tuple of `Option`. `complete_options` turns what a caller passed to `reset` into a
+complete dictionary of plain Python values, or raises one `ValueError` that says which option is wrong and what would be
+right.
 `options_table` prints the same rows as Markdown.
 """
 
@@ -83,7 +84,7 @@ class Option:
         return number if low <= number <= high or number in self.also else None
 
 
-def resolve(
+def complete_options(
     options: tuple[Option, ...], given: Mapping[str, Any] | None, owner: str, defaults: dict[str, Any] | None = None
 ) -> dict[str, Any]:
     """Completes the given reset options with the defaults: the options' own, unless other ones are given.

@@ -28,8 +28,8 @@ except ImportError:
     pygame = None  # type: ignore[assignment]
 
 VIEW = 504  # pixels, six for each of the agent's
-LINE, LINES, COLUMNS = 20, 7, 72  # height of a line of text in pixels, how many there are, and letters in one
-WINDOW = (VIEW, VIEW + LINE * LINES + 8)
+LINE_HEIGHT, TEXT_LINES, COLUMNS = 20, 7, 72  # of text: pixels, lines, and letters in a line
+WINDOW = (VIEW, VIEW + LINE_HEIGHT * TEXT_LINES + 8)
 INK, PAPER = (230, 230, 230), (30, 30, 30)
 FRAMES = 60  # looks at the keyboard in a second; steps are fewer
 HELP = "WASD or arrows: move, R: restart, Page Up/Down: seed, Esc: quit"
@@ -136,7 +136,7 @@ def show(game: Game, screen: Any, font: Any) -> None:
     screen.blit(pygame.transform.scale(picture, (VIEW, VIEW)), (0, 0))
     lines = [part for line in game.text().split("\n") for part in textwrap.wrap(line, COLUMNS) or [""]]
     for number, line in enumerate(lines):
-        screen.blit(font.render(line, True, INK), (6, VIEW + 6 + LINE * number))
+        screen.blit(font.render(line, True, INK), (6, VIEW + 6 + LINE_HEIGHT * number))
     pygame.display.flip()
 
 
@@ -144,7 +144,7 @@ def run(game: Game) -> None:
     """Opens the window and plays until it is closed."""
     screen = pygame.display.set_mode(WINDOW)
     pygame.display.set_caption(game.env_id)
-    font, clock, waited = pygame.font.Font(None, LINE), pygame.time.Clock(), 0
+    font, clock, waited = pygame.font.Font(None, LINE_HEIGHT), pygame.time.Clock(), 0
     wait = 1000 / game.env.metadata["render_fps"]  # milliseconds
     while listen(game):
         waited += clock.tick(FRAMES)

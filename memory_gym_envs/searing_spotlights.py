@@ -14,13 +14,13 @@ import numpy as np
 
 from memory_gym_envs.base import ALL, DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, widened
 from memory_gym_envs.bits import (
+    FULL_ROW,
     ITEMS,
-    LINE,
-    LINES,
-    NOTHING,
+    NO_SHAPE,
     PLACE_0,
     PLACES,
-    STEP,
+    SAMPLE_ROWS,
+    SAMPLE_STEP,
     Stencils,
     pixel_scratch,
     pixels,
@@ -50,7 +50,7 @@ from memory_gym_envs.options import Option
 from memory_gym_envs.words import below, pick, words
 
 TILE = 12  # pixels; the floor is a chessboard
-BAR = 4  # rows of the top bar
+TOP_BAR = 4  # rows of the top bar
 MIDDLE = SCREEN // 2
 OUTSIDE = math.sqrt(2 * SCREEN**2) / 2  # a spotlight starts and ends that far from the middle, and its radius more
 MARGIN = 7  # coins and the exit stay that far from the screen's edges
@@ -490,7 +490,7 @@ def spot_shapes(least: int, largest: int) -> tuple[list[np.ndarray], list[np.nda
     radii = range(least, largest + 1)
     disks = [disk(2 * radius, radius, radius, radius) for radius in radii]
     rims = [ring(2 * radius, radius, radius, radius, 1) for radius in radii]
-    return [NOTHING] * least + disks, [NOTHING] * least + rims
+    return [NO_SHAPE] * least + disks, [NO_SHAPE] * least + rims
 
 
 def draw_coins_and_exits(scales: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -571,7 +571,7 @@ def draw(s: State, drawing: DrawingTables, lanes: np.ndarray | slice) -> np.ndar
     layered = np.count_nonzero(s.layered[lanes])
     if layered:
         draw_layer(s, drawing, lanes, frames, BELOW_BAR)
-    frames.reshape(-1, SCREEN, ROW)[:, :BAR] = drawing.bars.take(bar_rows(s, lanes), axis=0)[:, None]
+    frames.reshape(-1, SCREEN, ROW)[:, :TOP_BAR] = drawing.bars.take(bar_rows(s, lanes), axis=0)[:, None]
     if layered:
         draw_layer(s, drawing, lanes, frames, ABOVE_BAR)
     return frames.reshape(-1, SCREEN, SCREEN, 3)
@@ -702,15 +702,17 @@ def darken(
 FAINT = 252  # the darkest dark in which an agent, (3, 3, 2) there, still differs from white floor
 SLIGHT = 5  # and the darkest one in which some colours may stay as they are
 FIRST_RIM = 51  # from there on a rim differs from all colours that it runs over, if only by 1
-LINES_BELOW = np.where(np.arange(0, SCREEN, STEP) < BAR, 0, LINE).astype(np.uint64)  # (42,) the sample below the bar
-TILE_SHARE = 1 / tile_counts(LINES_BELOW[None]).astype(np.float32)  # (1, 49)
+ROWS_BELOW = np.where(np.arange(0, SCREEN, SAMPLE_STEP) < TOP_BAR, 0, FULL_ROW).astype(
+    np.uint64
+)  # (42,) the sample below the bar
+TILE_SHARE = 1 / tile_counts(ROWS_BELOW[None]).astype(np.float32)  # (1, 49)
 FULL_SHARE = TILE_SHARE.min()  # of a tile beside the bar
-BLUE_LINES = sample((floors()[BLUE_FLOOR].reshape(SCREEN, SCREEN, 3) == BLUE).all(axis=-1))  # (42,) or red ones
+BLUE_SAMPLE = sample((floors()[BLUE_FLOOR].reshape(SCREEN, SCREEN, 3) == BLUE).all(axis=-1))  # (42,) or red ones
 NO_BITS = np.uint64(0)
 READING = slice(0, 8)  # the entries that come from the bar
 # By opacity: (256, 2) all bits where the darkness changes nothing, and where it hides nothing; and, where only the
 # latter is true, how bright the floor is, (256,).
-VEIL = (np.arange(256)[:, None] <= (SLIGHT, FAINT)) * LINE
+VEIL = (np.arange(256)[:, None] <= (SLIGHT, FAINT)) * FULL_ROW
 DUSK = ((1 - np.arange(256) / 255) * (VEIL[:, 1] > VEIL[:, 0])).astype(np.float32)
 
 
@@ -760,7 +762,7 @@ def vector_shapes(
     # An exit's frame is as black as the dark, so what can be seen of it is its door.
     things = [each for i in range(0, len(solids), 3) for each in (*solids[i : i + 2], images[i + 1].any(axis=-1))]
     shapes = disks + figures + things
-    return samples(shapes), samples(rims), stencils(shapes, BAR)
+    return samples(shapes), samples(rims), stencils(shapes, TOP_BAR)
 
 
 class FrameSamples(NamedTuple):
@@ -827,7 +829,7 @@ def layers(s: State, g: VectorTables, lanes: np.ndarray | slice) -> tuple[np.nda
     return raised, np.array([layer[raised] for layer in every])[..., None]
 
 
-def visible_parts(cover: np.ndarray, clear: np.ndarray, left: Any = LINES_BELOW) -> tuple[np.ndarray, np.ndarray]:
+def visible_parts(cover: np.ndarray, clear: np.ndarray, left: Any = ROWS_BELOW) -> tuple[np.ndarray, np.ndarray]:
     """What is visible of bodies and of the floor behind them, (K, n, 42) and (n, 42).
 
     cover: (K, n, 42) what the bodies cover, from front to back. clear: (n, 42). left: (42,) what nothing covers so far.
@@ -844,7 +846,7 @@ def visible_parts_in_layers(cover: np.ndarray, clear: np.ndarray, layer: np.ndar
     """The same where some of the bodies are above the darkness, and before all others. layer: (K, n, 1)."""
     above = np.where(layer == UNDER, NO_BITS, cover)
     free = ~np.bitwise_or.reduce(above, axis=0)
-    seen_above, _ = visible_parts(above, np.where(layer == ABOVE_BAR, LINE, LINES_BELOW), LINE)
+    seen_above, _ = visible_parts(above, np.where(layer == ABOVE_BAR, FULL_ROW, ROWS_BELOW), FULL_ROW)
     seen_below, floor = visible_parts(cover ^ above, clear & free)
     return seen_above | seen_below, floor & free
 
@@ -856,7 +858,7 @@ def write_bar(s: State, g: VectorTables, lanes: np.ndarray | slice, sampled: Fra
     if sampled.layer is not None and (sampled.layer == ABOVE_BAR).any():
         high, over_bar = sampled.raised, sampled.layer == ABOVE_BAR  # (m,), (K, m, 1)
         cover = g.high.at(sampled.x[:, high], sampled.y[:, high]) * over_bar  # (K, m, words)
-        left = ~np.bitwise_or.reduce(cover, axis=0).view(np.uint16).reshape(-1, BAR, ITEMS)
+        left = ~np.bitwise_or.reduce(cover, axis=0).view(np.uint16).reshape(-1, TOP_BAR, ITEMS)
         columns = unpacked(np.bitwise_or.reduce(left, axis=1))  # (m, 84) those of which anything is left
         out[high, READING] = read_bars(g.bars[senses[high]].reshape(-1, SCREEN, 3) * columns[..., None])
 
@@ -868,11 +870,11 @@ def write_rest(s: State, g: VectorTables, lanes: np.ndarray | slice, sampled: Fr
     if sampled.rim is not None:
         bright = np.where(s.rim[lanes][:, None], rims_left(sampled, sampled.rim), bright)
         dusk = dusk * ~s.rim[lanes]
-    lines = np.empty((bodies + 3, n, LINES), np.uint64)
+    lines = np.empty((bodies + 3, n, SAMPLE_ROWS), np.uint64)
     lines[:bodies] = seen
-    np.bitwise_and(cover[AGENT] & LINES_BELOW, ~seen[AGENT], out=lines[bodies])
+    np.bitwise_and(cover[AGENT] & ROWS_BELOW, ~seen[AGENT], out=lines[bodies])
     np.bitwise_xor(visible, bright, out=lines[bodies + 1])
-    np.bitwise_and(visible, BLUE_LINES, out=lines[bodies + 2])
+    np.bitwise_and(visible, BLUE_SAMPLE, out=lines[bodies + 2])
     any_ = np.bitwise_or.reduce(lines, axis=2) != 0  # (K + 3, n)
     out[:, g.at["dusk"].start] = dusk * any_[-2]
     out[:, g.at["alarm"].start] = (s.floor & s.reddens)[lanes] * any_[-1]
@@ -913,7 +915,7 @@ def write_tiles(g: VectorTables, seen: np.ndarray, any_: np.ndarray, bright: np.
 
 def rims_left(sampled: FrameSamples, rim: np.ndarray) -> np.ndarray:
     """What is visible of these rims, (n, 42): of any in a dark that is dark enough, and over all that is under it."""
-    rim = rim & LINES_BELOW & -(sampled.opacity >= FIRST_RIM)[:, None].astype(np.uint64)
+    rim = rim & ROWS_BELOW & -(sampled.opacity >= FIRST_RIM)[:, None].astype(np.uint64)
     if sampled.layer is not None:
         above = np.where(sampled.layer == UNDER, NO_BITS, sampled.cover[:, sampled.raised])
         rim[sampled.raised] &= ~np.bitwise_or.reduce(above, axis=0)
@@ -1325,13 +1327,13 @@ class SearingSpotlights(MemoryGymVectorEnv):
         """Lights everything below the bar, and circles the spotlights."""
         s, lanes = self.state, np.array([lane])
         lit = draw_in_full_light(s, self._drawing, lanes, True)
-        below = slice(BAR * DEBUG_ZOOM, None)
+        below = slice(TOP_BAR * DEBUG_ZOOM, None)
         frame[below] = magnify(lit.reshape(SCREEN, SCREEN, 3), DEBUG_ZOOM)[below]
         for slot in np.flatnonzero(s.spot_place[0, lane]).tolist():
             radius = int(s.spots[RADIUS, lane, slot])
             x, y = (s.spot_place[:, lane, slot] - radius * PLACES - PLACE_0).tolist()
             circle = ring(len(frame), x * DEBUG_ZOOM, y * DEBUG_ZOOM, radius * DEBUG_ZOOM, DEBUG_ZOOM)
-            circle[: BAR * DEBUG_ZOOM] = False
+            circle[: TOP_BAR * DEBUG_ZOOM] = False
             frame[circle] = GREEN
 
 
@@ -1364,7 +1366,7 @@ def _fading(duration: int, threshold: int) -> np.ndarray:
 def _figures(values: dict[str, Any]) -> tuple[Figure, Figure]:
     """The agent's figure as it walks across and as it walks down, where the bar is in its way."""
     scale, speed = values["agent_scale"], values["agent_speed"]
-    across, down = (Figure(scale, speed, low, SCREEN, radius_of(scale), False) for low in (0, BAR))
+    across, down = (Figure(scale, speed, low, SCREEN, radius_of(scale), False) for low in (0, TOP_BAR))
     return across, down
 
 

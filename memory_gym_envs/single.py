@@ -52,7 +52,7 @@ class MemoryGymEnv(gym.Env):
         if isinstance(seed, (list, tuple, np.ndarray)):
             raise ValueError(f"seed must be an integer or None, not {brief(seed)}")
         batch = self.batch
-        batch.restart(np.zeros(1, np.intp), lane_seeds(seed, 1), batch.resolve(options))
+        batch.restart(np.zeros(1, np.intp), lane_seeds(seed, 1), batch.complete_options(options))
         self._needs_reset = False
         return _only(batch.observe(ALL)), {"ground_truth": batch.ground_truth()[0]}
 
@@ -119,7 +119,7 @@ class MemoryGymEnv(gym.Env):
         try:
             for name, theirs in state["made_with"].items():
                 if name == "options":
-                    theirs = self.batch.resolve(theirs)
+                    theirs = self.batch.complete_options(theirs)
                 if theirs != ours[name]:
                     raise ValueError(f"it is of one with {name} {brief(theirs)}, not {brief(ours[name])}")
             self.batch.set_state(state["batch"])

@@ -18,7 +18,7 @@ from gymnasium.vector.utils import batch_space
 from memory_gym_envs.base import ALL, lane_seeds, one_of, overwrite
 from memory_gym_envs.bits import pixels
 from memory_gym_envs.drawing import FRAME, SCREEN
-from memory_gym_envs.options import brief, resolve
+from memory_gym_envs.options import brief, complete_options
 from memory_gym_envs.saving import Saved
 from memory_gym_envs.searing_spotlights import (
     SPEED,
@@ -362,10 +362,10 @@ class SpotlightPerturbation(PictureWrapper):
             if not isinstance(value, (int, np.integer)) or not 0 <= value <= 255:
                 raise ValueError(f"{name} must be an integer from 0 to 255, not {value!r}")
         self.clear, self.veil = np.uint16(255 - opacity), np.uint16(shade * opacity)
-        values = resolve(LIGHTS, lights, type(self).__name__)
+        values = complete_options(LIGHTS, lights, type(self).__name__)
         self.arguments = {"opacity": int(opacity), "shade": int(shade), **values}
         self._light = SearingSpotlights("SearingSpotlights-v0", self.num_envs)
-        self._settings = self._light.resolve({**values, **UNPLAYED})
+        self._settings = self._light.complete_options({**values, **UNPLAYED})
         least, largest = values["spot_min_radius"], values["spot_max_radius"]
         self._radii = int(least), int(max(least, largest))
 

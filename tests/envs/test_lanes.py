@@ -154,7 +154,7 @@ def test_reset_mask_resets_only_its_lanes(env_id, obs_type):
         for lane in (0, 2):
             check_same(lane_of(ours[0], lane), lane_of(theirs[0], lane))
             assert [part[lane] for part in ours[1:4]] == [part[lane] for part in theirs[1:4]]
-    assert envs.settings == [envs.defaults, envs.resolve(changed)] * 2
+    assert envs.settings == [envs.defaults, envs.complete_options(changed)] * 2
 
 
 def test_lanes_with_different_options_differ():

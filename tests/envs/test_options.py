@@ -20,7 +20,7 @@ def test_options_stay_until_the_next_explicit_reset(env_id):
     ends = [reward for step in steps for reward in step[1][step[2] | step[3]]]
     assert len(ends) > LANES  # several episodes a lane
     assert min(ends) == min(ends[LANES:]) == -1.0
-    assert envs.settings == [envs.resolve(hasty)] * LANES
+    assert envs.settings == [envs.complete_options(hasty)] * LANES
     envs.reset()
     assert envs.settings == [envs.defaults] * LANES
     assert all((step[1] >= 0).all() for step in roll(envs, 200))
@@ -31,9 +31,9 @@ def test_options_that_an_environment_is_made_with(env_id):
     """They are its defaults: Gymnasium's own vector environment, which resets without options, keeps them."""
     hasty = HASTY[FAMILY[env_id]]
     envs = make(env_id, options=hasty)
-    assert envs.defaults == make(env_id).resolve(hasty)
+    assert envs.defaults == make(env_id).complete_options(hasty)
     envs.reset(seed=0, options={"agent_scale": 0.5})
-    assert envs.settings == [make(env_id).resolve({**hasty, "agent_scale": 0.5})] * LANES
+    assert envs.settings == [make(env_id).complete_options({**hasty, "agent_scale": 0.5})] * LANES
     envs.reset(seed=0)
     same_step = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
     theirs = gym.make_vec(env_id, LANES, vectorization_mode="sync", vector_kwargs=same_step, options=hasty)
@@ -177,7 +177,7 @@ def test_values_may_be_numpys(env_id):
     """The settings are plain Python all the same."""
     numpys, envs = {"bool": np.bool_, "int": np.int64, "float": np.float64, "ints": np.array}, make(env_id)
     given = {option.name: numpys[option.kind](option.default) for option in envs.variant.options}
-    check_same(envs.resolve(given), envs.defaults)
+    check_same(envs.complete_options(given), envs.defaults)
 
 
 @EACH

@@ -13,7 +13,7 @@ import fuzz_original
 from memory_gym_envs import IDS
 from memory_gym_envs.character import DIAGONAL_FORTH, PAD, SPAN, STRIDES, Figure, sprites, walk_table
 from memory_gym_envs.drawing import ring
-from memory_gym_envs.options import resolve
+from memory_gym_envs.options import complete_options
 from memory_gym_envs.searing_spotlights import draw_coins_and_exits
 
 CROWD = {"spawn_interval": 1, "spot_min_speed": 1e-5, "spot_max_speed": 1e-4, "spot_damage": 0.0, "steps_per_coin": -1}
@@ -108,7 +108,7 @@ def test_attributes_of_the_original(env_id):
 def test_fuzz_draws_valid_options(env_id):
     table = gym.make(env_id).unwrapped.batch.variant.options
     for seed in range(100):
-        resolve(table, fuzz_original.draw_options(np.random.default_rng(seed), table), env_id)
+        complete_options(table, fuzz_original.draw_options(np.random.default_rng(seed), table), env_id)
 
 
 @pytest.mark.parametrize("env_id", IDS)
