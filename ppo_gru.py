@@ -91,8 +91,8 @@ class Args:
     """number of levels to train on (0: no limit); in environments of other packages, a level is a seed"""
     start_level: NonNegativeInt = 0
     """the first of these levels"""
-    obs_type: Literal["pixels", "vector"] = "pixels"
-    """what a Memory Gym environment shows: images, or vectors of what can be seen on them"""
+    obs_type: Literal["pixels", "grayscale", "vector"] = "pixels"
+    """what a Memory Gym environment shows: images in color or in gray, or vectors of what can be seen on them"""
     frame_stack: NonNegativeInt = 0
     """observe the last K images, in grayscale, or the last K vectors (0: the current one, in color)"""
     step_encoding: bool = False

@@ -17,7 +17,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from memory_gym_envs.drawing import grayscale, magnify
+from memory_gym_envs.drawing import gray, magnify
 from memory_gym_envs.entries import vector_space
 from memory_gym_envs.options import brief, complete_options
 from memory_gym_envs.saving import Saved, plain, restored
@@ -475,7 +475,7 @@ def grayscale_pictures(observations: Any) -> Any:
     """The observations with one channel instead of three in each picture."""
     if isinstance(observations, dict):
         return {key: grayscale_pictures(each) for key, each in observations.items()}
-    return grayscale(observations) if observations.dtype == np.uint8 else observations
+    return gray(observations)[..., None] if observations.dtype == np.uint8 else observations
 
 
 def overwrite(observations: Any, lanes: np.ndarray, fresh: Any) -> None:

@@ -12,7 +12,7 @@ ROW = 3 * SCREEN  # bytes in a row of a frame
 FRAME = SCREEN * ROW  # bytes in a frame
 FEW = 4  # sprites that are pasted faster one by one
 WHITE, RED, GREEN, BLUE = (255, 255, 255), (255, 0, 0), (0, 255, 0), (0, 0, 255)
-LUMINANCE = np.array([299, 587, 114])  # of red, green and blue, in thousandths (ITU-R BT.601)
+LUMA = np.array([77, 150, 29], np.float32) / 256  # ITU-R 601, in 256ths so that all sums are exact
 
 
 def disk(size: int, x: float, y: float, radius: int) -> np.ndarray:
@@ -174,9 +174,11 @@ def squares_of(images: np.ndarray, across: int, row: np.dtype) -> np.ndarray:
     return np.ndarray((starts, width), row, images, 0, (3, 3 * across))
 
 
-def grayscale(frames: np.ndarray) -> np.ndarray:
-    """The luminance of frames (..., 3), rounded: (..., 1) uint8."""
-    return ((frames @ LUMINANCE + 500) // 1000).astype(np.uint8)[..., None]
+def gray(frames: np.ndarray) -> np.ndarray:
+    """Pictures (..., 3) or (..., 1) uint8 in grayscale: (...) uint8, their luminance rounded to the nearest."""
+    if frames.shape[-1] == 1:
+        return frames[..., 0]
+    return (frames @ LUMA + np.float32(0.5)).astype(np.uint8)
 
 
 def read_only(table: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 
 from memory_gym_envs.base import ALL, lane_seeds, one_of, overwrite
 from memory_gym_envs.bits import pixels
-from memory_gym_envs.drawing import FRAME, SCREEN
+from memory_gym_envs.drawing import FRAME, SCREEN, gray
 from memory_gym_envs.options import brief, complete_options
 from memory_gym_envs.saving import Saved
 from memory_gym_envs.searing_spotlights import (
@@ -33,7 +33,6 @@ from memory_gym_envs.searing_spotlights import (
 OBSERVATION = "observation"  # the name of an observation that is no Dict, where it becomes a part of one
 STEP_ENCODING, LAST_ACTION = "step_encoding", "last_action"  # parts of a Dict that the wrappers add
 SINES, COSINES = "sines", "cosines"
-LUMA = np.array([77, 150, 29], np.float32) / 256  # ITU-R 601, in 256ths so that all sums are exact
 SPOT_STREAM = 2  # keeps the generators of the perturbation apart from those of the environment with the same seed
 HEAD_START = 0.3  # of its way, that a spotlight of the perturbation has gone when an episode begins
 SPAWNS = ("initial_spawns", "num_spawns", "initial_spawn_interval", "spawn_interval_threshold")
@@ -429,13 +428,6 @@ def one_hot(choices: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     found = np.zeros((len(choices), sizes.sum()), np.float32)
     found[np.arange(len(choices))[:, None], choices + (np.cumsum(sizes) - sizes)] = 1.0
     return found
-
-
-def gray(frames: np.ndarray) -> np.ndarray:
-    """Return pictures (..., 3) or (..., 1) uint8 in grayscale, (...) uint8, rounded to the nearest."""
-    if frames.shape[-1] == 1:
-        return frames[..., 0]
-    return (frames @ LUMA + np.float32(0.5)).astype(np.uint8)
 
 
 def stack_size(frames: int) -> int:

@@ -15,6 +15,7 @@ from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
 
 from memory_gym_envs import IDS, MortarMayhem
+from memory_gym_envs.drawing import gray
 from ppo_utils import video
 from ppo_utils.environments import (
     final_numbers,
@@ -25,7 +26,6 @@ from ppo_utils.environments import (
     parse_options,
 )
 from ppo_utils.video import LaneVideo, check_can_film
-from ppo_utils.wrappers import gray
 
 LANES = 3
 GYMNASIUM = {  # the widths of the vectors that they become

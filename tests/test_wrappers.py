@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import FrameStackObservation, TransformObservation
 from players import choices
 
+from memory_gym_envs.drawing import gray
 from memory_gym_envs.searing_spotlights import BEND, START, TOWARD
 from ppo_utils.wrappers import (
     FourierFeatures,
@@ -19,7 +20,6 @@ from ppo_utils.wrappers import (
     SpotlightPerturbation,
     StepEncoding,
     VectorStack,
-    gray,
 )
 
 LANES = 3

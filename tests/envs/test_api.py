@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from helpers import EACH, EACH_OBS, HASTY, LANES, make, roll
+from helpers import EACH, EACH_OBS, HASTY, LANES, check_same, make, picture, roll
 from players import FAMILY
 
 import memory_gym_envs
@@ -46,6 +46,39 @@ def test_spaces(env_id, obs_type):
         assert observations in envs.observation_space
         assert (rewards.dtype, terminated.dtype, truncated.dtype) == (np.float64, np.bool_, np.bool_)
         assert rewards.shape == terminated.shape == truncated.shape == (LANES,)
+
+
+@EACH
+def test_grayscale(env_id):
+    """Pictures of one channel that are the luminance of the others, in every observation that a step returns."""
+    color, shades = make(env_id), make(env_id, obs_type="grayscale")
+    space = shades.single_observation_space
+    shown = space["visual_observation"] if isinstance(space, gym.spaces.Dict) else space
+    assert (shown.shape, shown.dtype) == ((84, 84, 1), np.uint8)
+    single = gym.make(env_id, obs_type="grayscale")
+    check_env(single.unwrapped)
+    assert single.observation_space == space
+
+    options = HASTY[FAMILY[env_id]]
+    seen = [(envs.reset(seed=3, options=options)[0], *roll(envs, 90)) for envs in (color, shades)]
+    ends = 0
+    check_gray(seen[0][0], seen[1][0])
+    for (left, *numbers, infos), (right, *others, their_infos) in zip(seen[0][1:], seen[1][1:], strict=True):
+        check_gray(left, right)
+        check_same(numbers, others)
+        for one, other in zip(infos.get("final_obs", []), their_infos.get("final_obs", []), strict=True):
+            if one is not None:
+                check_gray(one, other)
+                ends += 1
+    assert ends > LANES
+
+
+def check_gray(colored, shades):
+    """The second observation is the first one with its picture's luminance, rounded; the rest is the same."""
+    luminance = picture(colored) @ np.array([0.299, 0.587, 0.114])
+    assert np.abs(picture(shades)[..., 0] - luminance).max() < 1
+    if isinstance(colored, dict):
+        check_same(colored["vector_observation"], shades["vector_observation"])
 
 
 @EACH
