@@ -391,15 +391,19 @@ def summary(args: Any, run: Run) -> str:
     elif run.returns:
         score = f"return {np.mean(run.returns):.2f}, mean of the last {len(run.returns)} episodes"
     folder = shlex.quote(str(run.folder))
+    # A wheel has these modules in this package, and the scripts at top level.
+    installed = Path(__file__).with_name("evaluate.py").exists()
+    evaluate, enjoy = ("-m ppo_utils.evaluate", "-m ppo_utils.enjoy") if installed else ("evaluate.py", "enjoy.py")
+    script = f"-m {run.script}" if installed else f"{run.script}.py"
     lines = [f"{run.folder}: {run.step:,} steps, {score}"]
     checkpoints = checkpoints_in(run.folder)[-1:]
     if run.stop and checkpoints:
-        lines.append(f"resume: python {run.script}.py --resume {folder}")
+        lines.append(f"resume: python {script} --resume {folder}")
     for model in [run.folder / "model.pt"] if args.save_model else checkpoints:
-        lines.append(f"evaluate: python evaluate.py {shlex.quote(str(model))}")
+        lines.append(f"evaluate: python {evaluate} {shlex.quote(str(model))}")
         with contextlib.suppress(ValueError):
             check_draws("enjoy.py", args.env_id)
-            lines.append(f"watch: python enjoy.py {shlex.quote(str(model))} --out page.html")
+            lines.append(f"watch: python {enjoy} {shlex.quote(str(model))} --out page.html")
     return "\n".join([*lines, f"plot: tensorboard --logdir {folder}"])
 
 

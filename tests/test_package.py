@@ -53,7 +53,7 @@ def run(site, *arguments):
 
 
 def test_the_environments_alone(alone):
-    sources = {f"memory_gym_envs/{path.name}" for path in ENVS.glob("*.py")}
+    sources = {str(path.relative_to(ROOT)) for path in ENVS.rglob("*.py")}
     assert modules(alone) == sources | {"memory_gym_envs/py.typed"}
     for name in modules(alone):
         assert alone.read(name) == (ROOT / name).read_bytes()
@@ -95,6 +95,17 @@ def test_the_whole_repository_leaves_common_names_free(whole, tmp_path):
         done = run(tmp_path, "-m", f"ppo_utils.{name}", "--help")
         assert (done.stderr, done.returncode) == ("", 0)
         assert "usage: " in done.stdout
+
+
+def test_a_training_of_an_installed_script_ends_with_commands_that_work(whole, tmp_path):
+    whole.extractall(tmp_path)
+    few = "--preset quickstart --num-envs 8 --num-steps 16 --total-timesteps 128 --save-model --no-cuda"
+    done = run(tmp_path, "-m", "ppo_gru", *few.split())
+    commands = dict(line.split(": python ") for line in done.stdout.splitlines() if ": python " in line)
+    assert set(commands) == {"evaluate", "watch"}, done.stderr
+    for command in commands.values():
+        done = run(tmp_path, *command.split())
+        assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(("project", "name"), [(ROOT, "ppo_utils"), (ROOT, "evaluate"), (ENVS, "memory_gym_envs")])
