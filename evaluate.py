@@ -380,11 +380,12 @@ def with_defaults(given: dict[str, str]) -> dict[str, str]:
 def write_run(run: RunLog, path: str) -> None:
     """Write what tables and pictures need, in a few KB; `read_run` reads it as it reads the run's folder.
 
-    That is the machine, the arguments, the evaluations in the family's own metric, return, length and falls, the
-    seconds of each iteration, and the curves UPDATE_CURVES, averaged to POINTS. Steps are kept as differences, which
-    compress better.
+    That is the machine, the arguments, the evaluations in the family's own metric, return, length and falls, those on
+    test levels too, the seconds of each iteration, and the curves UPDATE_CURVES, averaged to POINTS. Steps are kept as
+    differences, which compress better.
     """
-    names = [f"eval/{name}" for name in (own_metric(run.args["env_id"]), "return", "length", "num_fails")]
+    metrics = (own_metric(run.args["env_id"]), "return", "length", "num_fails")
+    names = [f"{levels}/{name}" for levels in ("eval", "test") for name in metrics]
     kept = {name: run.curves[name] for name in (*dict.fromkeys(names), *SECONDS.values()) if name in run.curves}
     for name in UPDATE_CURVES:
         if name in run.curves:
@@ -392,7 +393,7 @@ def write_run(run: RunLog, path: str) -> None:
             kept[name] = steps, values[:, 0]
     four_digits = np.vectorize(lambda value: float(f"{value:.4g}"))  # also of small norms; scores have few digits
     curves = {
-        name: (np.diff(steps, prepend=0).tolist(), (values if "eval/" in name else four_digits(values)).tolist())
+        name: (np.diff(steps, prepend=0).tolist(), (values if name in names else four_digits(values)).tolist())
         for name, (steps, values) in kept.items()
     }
     part = Path(f"{path}.part")

@@ -5,12 +5,14 @@
     python benchmarks/learning.py --suite full --results benchmarks/results
 
 The small suite has tasks that take minutes on a core; the full one has the ten environments as they are. Agents have
-vector observations and small networks, and all see the same vectors, a frame stack the last few. Scores are those of
-evaluations during training, on levels outside the training set (6.1.3).
+vector observations and small networks, and all see the same vectors, a frame stack the last few. Two sets of levels
+are outside of the training set. Evaluations during training (6.1.3) are on the development levels, which follow the
+training's: curves are made of them, settings and seeds chosen by them. At the end, the final weights play TEST_LEVELS
+test levels once: what is published is their score.
 
-What a run reached is kept in a file of a few KB in --results, which `evaluate.py --curves` can draw too. A run whose
-file is there is not trained again; one that was stopped goes on from its last checkpoint in --folder. With --report,
-nothing is trained.
+What a run reached is kept in a file of a few KB, in a folder of --results for its environment; `evaluate.py --curves`
+can draw these files too. A run whose file is there is not trained again; one that was stopped goes on from its last
+checkpoint in --folder. With --report, nothing is trained.
 """
 
 import contextlib
@@ -45,6 +47,7 @@ from ppo_utils.runs import parse_args
 
 ROOT = Path(__file__).parent.parent
 COMMON = "--preset laptop --save-model"
+TEST_LEVELS, FIRST_TEST_LEVEL = 1000, 1_000_000
 TRXL = "ppo_trxl.py --no-trxl-query-position --no-trxl-memory-gradient"  # the thesis', where the preset differs
 MEMORIES = {
     "GRU": "ppo_gru.py --memory gru",
@@ -305,10 +308,12 @@ def runs_in(place: str, plan: Plan) -> list[evaluate.RunLog]:
 
 def result_of(config: Training, plan: Plan) -> evaluate.RunLog | None:
     """Return the finished run, if its result is there, with the curve `eval/{plan.task.score}`."""
-    run = next(iter(runs_in(str(config.results), plan)), None)
+    run = next(iter(runs_in(f"{config.results}/{plan.task.env_id}", plan)), None)
     if run is not None and plan.task.best_return is not None:
-        steps, returns = run.curves["eval/return"]
-        run.curves[f"eval/{plan.task.score}"] = steps, returns / plan.task.best_return
+        for levels in ("eval", "test"):
+            if f"{levels}/return" in run.curves:
+                steps, returns = run.curves[f"{levels}/return"]
+                run.curves[f"{levels}/{plan.task.score}"] = steps, returns / plan.task.best_return
     return run
 
 
@@ -378,7 +383,26 @@ def write_result(config: Training, plan: Plan) -> None:
             f"{plan}, has no {metric} at its end: an evaluation was cut short; give the agent more steps, as "
             f'"{plan.agent} --eval-max-steps 100000"'
         )
-    evaluate.write_run(replace(run, machine=machine()), f"{config.results}/{Path(run.path).name}.json.gz")
+    curves = run.curves | test_scores(plan, run)
+    result = config.results / plan.task.env_id / f"{Path(run.path).name}.json.gz"
+    result.parent.mkdir(parents=True, exist_ok=True)
+    evaluate.write_run(replace(run, curves=curves, machine=machine()), str(result))
+
+
+def test_scores(plan: Plan, run: evaluate.RunLog) -> dict[str, tuple[list[int], np.ndarray]]:
+    """Let the run's final weights play the test levels; return a curve of one point for each metric.
+
+    Raises SystemExit if that fails.
+    """
+    scores = Path(run.path) / "test_scores.json"
+    flags = ["--start-level", FIRST_TEST_LEVEL, "--levels", TEST_LEVELS, "--repeats", 1, "--json", scores]
+    command = [sys.executable, ROOT / "evaluate.py", Path(run.path) / "model.pt", *flags]
+    done = subprocess.run([str(each) for each in command], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{plan}, could not be scored: {done.stderr.strip()}")
+    (task,) = json.loads(scores.read_text())
+    metrics = task["agents"][0]["metrics"]
+    return {f"test/{name}": ([run.last_step], np.array(each["scores"])) for name, each in metrics.items()}
 
 
 def machine() -> str:

@@ -111,6 +111,7 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     agent, task = "GRU, refreshed", learning.TASKS["mortar-mayhem"]
     small = "--num-envs 4 --num-steps 32 --num-minibatches 2 --hidden-size 8 --eval-levels 2"
     monkeypatch.setattr(learning, "COMMON", f"{learning.COMMON} {small}")
+    monkeypatch.setattr(learning, "TEST_LEVELS", 5)
     config = learning.Config(
         tasks=("mortar-mayhem",),
         agents=(agent,),
@@ -149,6 +150,11 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
         for one, other in zip(kept.curves[name], whole.curves[name], strict=True):
             assert one == pytest.approx(other, rel=1e-3)
     assert kept.curves["eval/return"][1].shape == (3, 2, 3)
+    steps, tested = kept.curves["test/carried_out"]
+    assert (steps.tolist(), tested.shape) == ([whole.last_step], (1, 5, 1))
+    played = evaluate.Config(start_level=1_000_000, levels=5, repeats=1, seed=1)
+    returns = evaluate.play(evaluate.Checkpoint.read(f"{whole.path}/model.pt"), played)["return"]
+    assert tested[0] == pytest.approx(returns / 0.4), "of four commands, 0.1 each"
     carried_out = kept.curves["eval/carried_out"][1]
     assert carried_out == pytest.approx(kept.curves["eval/return"][1] / 0.4), "of four commands, 0.1 each"
 
