@@ -19,7 +19,7 @@ import gymnasium as gym
 import numpy as np
 
 from memory_gym_envs import IDS, MemoryGymEnv
-from memory_gym_envs.mortar_mayhem import VECTOR_ORDER
+from memory_gym_envs.mortar_mayhem.options import VECTOR_ORDER
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 try:

@@ -15,7 +15,8 @@ from memory_gym_envs import IDS, MortarMayhem, MysteryPath, SearingSpotlights
 from memory_gym_envs.base import ALL
 from memory_gym_envs.character import FACINGS, PAD
 from memory_gym_envs.entries import vector_slices, vector_space
-from memory_gym_envs.mortar_mayhem import COMMANDS, SYMBOL, SYMBOL_AT
+from memory_gym_envs.mortar_mayhem.arena import COMMANDS
+from memory_gym_envs.mortar_mayhem.drawing import SYMBOL, SYMBOL_AT
 from memory_gym_envs.mystery_path import PIT_ROWS, ROWS, SIDE
 from memory_gym_envs.searing_spotlights import AGENT, COIN, EXIT
 

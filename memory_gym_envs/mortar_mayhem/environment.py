@@ -1,0 +1,287 @@
+"""The class of the family: what Gymnasium asks of it, for N lanes at once.
+
+Shape letters: N lanes, n some of them, V entries of a vector observation.
+"""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from memory_gym_envs.base import MemoryGymVectorEnv, limit_of, numbered
+from memory_gym_envs.character import SPAN, STRIDES, Figure, agent_tables, free_controls, grid_controls, radius_of, walk
+from memory_gym_envs.drawing import SCREEN
+from memory_gym_envs.mortar_mayhem.arena import COMMANDS, FLOORS, TILE, TORUS_SIZE, first_pixel
+from memory_gym_envs.mortar_mayhem.drawing import circle_target, draw
+from memory_gym_envs.mortar_mayhem.levels import sample_level, write_level
+from memory_gym_envs.mortar_mayhem.options import VARIANTS, VECTOR_COMMANDS, MortarVariant
+from memory_gym_envs.mortar_mayhem.rules import burn_agents, extend_sequence, extinguish_tiles, ignite_tiles, show_clue
+from memory_gym_envs.mortar_mayhem.state import State
+from memory_gym_envs.mortar_mayhem.vectors import make_vector_tables, make_vectors
+from memory_gym_envs.state import empty, make_room
+from memory_gym_envs.words import below, words
+
+EVERY_LANE: Any = np.True_  # a mask for when all lanes act
+
+
+class MortarMayhem(MemoryGymVectorEnv):
+    """Mortar Mayhem (thesis 4.3): memorise a sequence of commands, then carry them out in time.
+
+    ## Description
+
+    Commands are shown one by one while the agent cannot move (the clue). Then it has `explosion_delay` steps to carry
+    out each: move to the neighbouring tile that it names, or stay. Then all tiles but that one burn for
+    `explosion_duration` steps, and an agent on a burning tile fails.
+
+    - `MortarMayhem-v0`: 10 commands on a 5 x 5 arena. `MortarMayhem-Grid-v0`: the same, tile by tile, no diagonals.
+    - `MortarMayhemB-v0`, `MortarMayhemB-Grid-v0`: the act task alone, the commands given as a vector, no clue.
+    - `Endless-MortarMayhem-v0`: a 6 x 6 torus that fills the screen. One command is shown and carried out. Each
+      completed sequence then grows by one command: only the new one is shown, and the agent carries out all of them,
+      starting where it is.
+
+    ## Action Space
+
+    `MultiDiscrete([3, 3])`:
+
+    | value | horizontal | vertical |
+    |---|---|---|
+    | 0 | none | none |
+    | 1 | left | up |
+    | 2 | right | down |
+
+    `Discrete(4)`, Grid ids:
+
+    | value | action |
+    |---|---|
+    | 0 | nothing |
+    | 1 | turn left |
+    | 2 | turn right |
+    | 3 | one tile forward |
+
+    Actions are ignored while a clue is shown.
+
+    ## Observation Space
+
+    `Box(0, 255, (84, 84, 3), uint8)`, rows first. The B ids: `Dict` of `visual_observation`, that Box, and
+    `vector_observation` (180,) float32: 20 commands by 9 one-hot entries in the order of VECTOR_ORDER, zeros after the
+    last command. With obs_type="grayscale", pictures have one channel: (84, 84, 1). With obs_type="vector", a flat
+    float32 vector without a picture: `docs/vectors.md`, `VARIANTS[id].entries`.
+
+    ## Rewards
+
+    `reward_command_success` (0.1) for each command that is carried out when it is checked, `reward_command_failure` (0)
+    on a burning tile, `reward_episode_success` (0) added when the last command is checked.
+
+    ## Episode End
+
+    Terminated by failure, or by the last command's check (not in the endless id). Truncated after `max_steps` steps
+    (the endless id; a failure at that very step counts as termination). With default options an episode takes 58 to
+    274 steps (table 4.4), Grid 46 to 118, B 19 to 235, B-Grid 7 to 79. The B bounds are one above the thesis' formula
+    (18 to 234, 6 to 78), because the first command has explosion_delay + 1 steps. With a clue the total agrees, because
+    the reset already shows the clue's first step.
+
+    ## Info
+
+    `ground_truth` (2,): the target tile's column and row, divided by arena size - 1. At an episode's end also `reward`,
+    `length`, `commands_completed` and `success` (in the endless id `max_command_sequence`, the length of the longest
+    completed sequence). commands_completed is a share of the sequence, in the endless id a number of commands.
+
+    ## Arguments
+
+    `gym.make(id, ...)` and `gym.make_vec(id, num_envs=N, ...)` take
+
+    | name | default | meaning |
+    |---|---|---|
+    | `render_mode` | None | "rgb_array": what the agent sees; "debug_rgb_array": 336 x 336, with the ground truth |
+    | `num_levels`, `start_level` | None, 0 | resets without a seed play one of num_levels levels, from start_level on |
+    | `obs_type` | "pixels" | "pixels", "grayscale": one channel, or "vector" |
+    | `options` | None | reset parameters that are the environment's defaults |
+    | `max_episode_steps` | None | truncates longer episodes |
+    | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
+
+    `reset(options={...})` takes the same reset parameters, a single environment for one episode. `docs/options.md` and
+    `VARIANTS[id].options` list them. Those marked * are lists, one entry of which is sampled at every reset.
+
+    ## Version History
+
+    - v0: as in memory-gym 1.0.2, except for the differences below.
+
+    ## References
+
+    Marco Pleines: Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games. Dissertation, TU
+    Dortmund University. Marco Pleines, Matthias Pallasch, Frank Zimmer, Mike Preuss: Memory Gym, arXiv:2309.17207.
+
+    ## Kept from the original
+
+    - The command that ends the episode counts as uncompleted, even if it was checked and carried out before the agent
+      walked into the fire.
+    - Failing at the very last command counts as success and completes all commands, but only the failure's reward is
+      paid.
+    - The sequence grows even if its last command failed, and max_command_sequence then counts it as completed.
+    - Walking into the fire overwrites the reward of the step.
+    - In the endless id the tiles stay lit while a clue is shown. Positions are rounded to the nearest pixel there;
+      elsewhere steps are cut off, a diagonal one to 2 pixels at the default speed. An agent whose centre is beyond the
+      screen's edge is on no tile.
+    - Grid ids ignore agent_scale.
+
+    ## Differences from the original
+
+    - Images are rows first.
+    - max_steps truncates.
+    - Every id reports the ground truth.
+    - An episode's first frames show this episode's agent, not the last one's.
+    - Wrong options raise ValueError.
+    """
+
+    variants = VARIANTS
+    tables = ("_agent_tables", "_vector_tables")
+    kept = (*MemoryGymVectorEnv.kept, "_clues_open")
+    variant: MortarVariant
+
+    def spaces(self) -> tuple[gym.Space, gym.Space]:
+        """The observation space of one lane with pixels, and its action space."""
+        image = gym.spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8)
+        vector = gym.spaces.Box(0.0, 1.0, (VECTOR_COMMANDS * len(COMMANDS),), np.float32)
+        both = gym.spaces.Dict({"visual_observation": image, "vector_observation": vector})
+        actions = gym.spaces.Discrete(4) if self.variant.grid else gym.spaces.MultiDiscrete([3, 3])
+        return image if self.variant.clue else both, actions
+
+    def allocate(self) -> None:
+        """Makes the state of N lanes."""
+        self.state = empty(State, N=self.num_envs, C=1, L=1)
+        self.figures = (self._figure(self.defaults),)  # the different ones of all lanes
+        self._clues_open = False  # whether any lane may still have a clue to see
+        self.place_tables()
+
+    def configure(self, lanes: np.ndarray) -> None:
+        """Takes over the options of the lanes, and the tables that all lanes' options need."""
+        s, variant, values = self.state, self.variant, self.settings[int(lanes[0])]
+        count = values["initial_command_count"] if variant.endless else max(values["command_count"])
+        make_room(s, "C", count + 1)
+        if variant.clue:
+            period = max(values["command_show_duration"]) + max(values["command_show_delay"])
+            make_room(s, "L", count * period + 1)
+        size = values.get("arena_size", TORUS_SIZE)
+        s.size[lanes] = size
+        s.calm_floor[lanes] = FLOORS.index((size, None))
+        s.visual_feedback[lanes] = values["visual_feedback"]
+        s.reward_success[lanes] = values["reward_command_success"]
+        s.reward_failure[lanes] = values["reward_command_failure"]
+        s.reward_episode[lanes] = values.get("reward_episode_success", 0.0)
+        s.step_limit[lanes] = limit_of(values.get("max_steps", -1))
+        self.figures, s.figure[:] = numbered([self._figure(each) for each in self.settings])
+        self.place_tables()
+
+    def _figure(self, values: dict[str, Any]) -> Figure:
+        """The agent's figure under these options."""
+        size = values.get("arena_size", TORUS_SIZE)
+        low, high = first_pixel(size), first_pixel(size) + TILE * size
+        if self.variant.grid:
+            return Figure(0.25, TILE, low, high, TILE // 2, False)
+        scale = values["agent_scale"]
+        return Figure(scale, values["agent_speed"], low, high, radius_of(scale), self.variant.endless)
+
+    def place_tables(self) -> None:
+        """Looks up the tables that follow from the options, and where each lane's rows start in them."""
+        self._agent_tables = agent_tables(self.figures)
+        self._controls = grid_controls() if self.variant.grid else free_controls()
+        self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
+        self._lane_clue = np.arange(self.num_envs) * self.state.clue.shape[1]  # (N,)
+        if self.obs_type == "vector":
+            self._vector_tables = make_vector_tables(self.variant, self.figures, self.state.figure)
+
+    def begin(self, lanes: np.ndarray) -> None:
+        """Samples the lanes' next levels and starts their episodes."""
+        for lane in lanes.tolist():
+            level = sample_level(self._rngs[lane], self.settings[lane], self.variant)
+            write_level(self.state, lane, level, self.variant)
+        self._clues_open = self.variant.clue
+
+    def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Applies the rules for one step: rewards, terminations, truncations, each (N,)."""
+        s = self.state
+        rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, bool)
+        s.length += 1
+        acting = self._acting_lanes()
+        if np.count_nonzero(acting):
+            self._move(actions, acting)
+            s.timer -= acting
+            due = s.timer == 0  # only a lane that acts gets there
+            if np.count_nonzero(due):
+                self._change_tiles(due.nonzero()[0], rewards, terminated)
+            burn_agents(s, acting, rewards, terminated)
+            s.episode_return += rewards
+        endless = self.variant.endless
+        truncated = (s.length == s.step_limit) & ~terminated if endless else np.zeros(self.num_envs, bool)
+        return rewards, terminated, truncated
+
+    def _acting_lanes(self) -> np.ndarray:
+        """Shows the clues' next step. Which lanes may act: (N,) bool, or EVERY_LANE while no clue is shown."""
+        if not self._clues_open:
+            return EVERY_LANE
+        acting = show_clue(self.state, self._lane_clue)
+        self._clues_open = bool(np.count_nonzero(acting) < self.num_envs)
+        return acting
+
+    def _move(self, actions: np.ndarray, acting: np.ndarray) -> None:
+        """Turns and moves the agents that may act."""
+        s = self.state
+        action = actions if self.variant.grid else actions[:, 0] * 3 + actions[:, 1]  # (N,)
+        if acting is not EVERY_LANE:
+            action = np.where(acting, action, self._controls.actions - 1)
+        s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._agent_tables.walk)
+
+    def _change_tiles(self, lanes: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
+        """Puts out the lanes' tiles that burn, and lights those that do not, which checks the command."""
+        s = self.state
+        burning = s.burning[lanes]
+        if np.count_nonzero(burning):
+            extinguish_tiles(s, lanes[burning])
+            lanes = lanes[~burning]
+        if lanes.size:
+            rewards[lanes], sequence_over = ignite_tiles(s, lanes)
+            if self.variant.endless:
+                for lane in lanes[sequence_over].tolist():
+                    self._extend_sequence(lane)
+            else:
+                # Whether or not the last command was carried out, as in the original; a failure overwrites the reward.
+                rewards[lanes] += s.reward_episode[lanes] * sequence_over
+                terminated[lanes] = sequence_over
+
+    def _extend_sequence(self, lane: int) -> None:
+        """Appends a random command to the lane's sequence."""
+        extend_sequence(self.state, lane, below(words(self._rngs[lane]), self.settings[lane]["allowed_commands"]))
+        self._clues_open = True
+
+    def pixels(self, lanes: np.ndarray | slice) -> Any:
+        """Fresh observations of the lanes with pixels, of the act task alone as a Dict."""
+        if self.variant.clue:
+            return self.frames(lanes)
+        vector = self.state.vector[lanes]
+        return {"visual_observation": self.frames(lanes), "vector_observation": vector.copy()}
+
+    def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh vector observations of the lanes, (n, V) float32."""
+        return make_vectors(self.state, self._vector_tables, lanes)
+
+    def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh frames of the lanes, (n, 84, 84, 3) uint8."""
+        return draw(self.state, self._agent_tables.sheet, lanes)
+
+    def ground_truth(self) -> np.ndarray:
+        """A fresh (N, 2): the target's column and row, divided by arena size - 1."""
+        return self.state.truth.copy()
+
+    def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
+        """The lanes' ended episodes in numbers, each (n,)."""
+        s = self.state
+        numbers = {"reward": s.episode_return[lanes], "length": s.length[lanes]}
+        if self.variant.endless:
+            return numbers | {"commands_completed": s.completed[lanes], "max_command_sequence": s.count[lanes] - 1}
+        success = (s.current[lanes] >= s.count[lanes]).astype(np.int64)
+        share = (s.current[lanes] - 1 + success) / s.count[lanes]
+        return numbers | {"success": success, "commands_completed": share}
+
+    def annotate(self, frame: np.ndarray, lane: int) -> None:
+        """Circles the lane's target tile in its magnified frame, in place."""
+        circle_target(frame, self.state, lane)

@@ -1,0 +1,106 @@
+"""Levels: what the generator decides at a reset, and how an episode starts with it."""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from memory_gym_envs.mortar_mayhem.arena import COMMANDS, MOVES, TILE, TORUS_SIZE, tile_tables
+from memory_gym_envs.mortar_mayhem.options import VECTOR_ORDER, MortarVariant
+from memory_gym_envs.mortar_mayhem.rules import set_target, write_clue
+from memory_gym_envs.mortar_mayhem.state import State
+from memory_gym_envs.words import below, pick, words
+
+VECTOR_INDEX = [VECTOR_ORDER.index(command) for command in COMMANDS]
+
+
+class Level(NamedTuple):
+    """What the generator decides at a reset."""
+
+    tile: int  # where the agent starts: column * arena size + row
+    offset: tuple[int, int]  # how far from the tile's centre, x and y in pixels
+    commands: list[int]
+    show_duration: int
+    show_delay: int
+    explosion_duration: int
+    explosion_delay: int
+
+
+def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: MortarVariant) -> Level:
+    """Samples a level in the original's order, so that its seeds mean the same here."""
+    word = words(rng)
+    size = TORUS_SIZE if variant.endless else values["arena_size"]
+    tile = below(word, size * size)
+    offset = (below(word, 4) - 2, below(word, 4) - 2) if variant.jitter else (0, 0)
+    if variant.endless:
+        kinds = values["allowed_commands"]
+        commands = [below(word, kinds) for _ in range(values["initial_command_count"])]
+    else:
+        commands = sample_walk(word, tile, pick(word, values["command_count"]), size, values["allowed_commands"])
+    show_duration = pick(word, values["command_show_duration"]) if variant.clue else 0
+    show_delay = pick(word, values["command_show_delay"]) if variant.clue else 0
+    explosion_duration = pick(word, values["explosion_duration"])
+    explosion_delay = pick(word, values["explosion_delay"])
+    return Level(tile, offset, commands, show_duration, show_delay, explosion_duration, explosion_delay)
+
+
+def sample_walk(word: Callable[[], int], tile: int, count: int, size: int, kinds: int) -> list[int]:
+    """So many commands that lead from the tile through the arena without leaving it.
+
+    tile: column * size + row. kinds: how many kinds of command may occur.
+    """
+    moves = moves_inside(size, kinds)
+    commands = []
+    for _ in range(count):
+        valid = moves[tile]
+        command, tile = valid[below(word, len(valid))]
+        commands.append(command)
+    return commands
+
+
+@cache
+def moves_inside(size: int, kinds: int) -> list[list[tuple[int, int]]]:
+    """For every tile the commands that stay inside the arena, each with the tile it leads to."""
+    moves = list(enumerate(MOVES[:kinds].tolist()))
+    return [
+        [
+            (command, (x + dx) * size + y + dy)
+            for command, (dx, dy) in moves
+            if 0 <= x + dx < size and 0 <= y + dy < size
+        ]
+        for x in range(size)
+        for y in range(size)
+    ]
+
+
+def write_level(s: State, lane: int, level: Level, variant: MortarVariant) -> None:
+    """Starts the lane's episode at this level."""
+    count, tiles = len(level.commands), tile_tables()
+    start = int(s.calm_floor[lane]) + 1 + level.tile  # FLOORS has an arena's calm floor before its tiles
+    s.pos[lane] = tiles.corner[start] + TILE // 2
+    if variant.jitter:
+        s.pos[lane] += level.offset
+    set_target(s, lane, tiles.next[start, level.commands[0]])
+    s.facing[lane] = s.current[lane] = s.completed[lane] = s.length[lane] = s.episode_return[lane] = 0
+    s.burning[lane] = False
+    s.floor[lane] = s.calm_floor[lane]
+    s.count[lane] = count
+    s.commands[lane, :count] = level.commands
+    s.explosion_delay[lane], s.explosion_duration[lane] = level.explosion_delay, level.explosion_duration
+    s.show_duration[lane], s.show_delay[lane] = level.show_duration, level.show_delay
+    s.timer[lane] = level.explosion_delay + 1  # the first command has a step more than the others
+    if variant.clue:
+        write_clue(s, lane, level.commands)
+        s.clue_step[lane] = 0
+        s.symbol[lane] = s.clue[lane, 0]
+    else:
+        write_command_vector(s, lane, level.commands)
+
+
+def write_command_vector(s: State, lane: int, commands: list[int]) -> None:
+    """Writes the commands as one-hot rows, in the order of VECTOR_ORDER."""
+    vector = s.vector[lane]  # (180,)
+    vector.fill(0.0)
+    for step, command in enumerate(commands):
+        vector[len(COMMANDS) * step + VECTOR_INDEX[command]] = 1.0

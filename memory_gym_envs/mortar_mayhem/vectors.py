@@ -1,0 +1,120 @@
+"""Vector observations.
+
+Shape letters: F floors, N lanes, n some of them, V entries of a vector observation.
+"""
+
+from functools import cache, lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from memory_gym_envs.appearance import (
+    CORNERS,
+    AppearanceTables,
+    View,
+    covered,
+    make_appearance_tables,
+    write_agent_entries,
+)
+from memory_gym_envs.character import FACINGS, PAD, Figure, sprites
+from memory_gym_envs.drawing import SCREEN, read_only
+from memory_gym_envs.entries import vector_slices
+from memory_gym_envs.mortar_mayhem.arena import ARENA_SIZES, COMMANDS, FLOORS, TILE, first_pixel, tile_tables
+from memory_gym_envs.mortar_mayhem.drawing import SYMBOL, SYMBOL_AT, symbols
+from memory_gym_envs.mortar_mayhem.options import MortarVariant
+from memory_gym_envs.mortar_mayhem.state import State
+
+# (10, 9) a command as one-hot, for every symbol; BLANK: zeros
+COMMAND_ENTRIES = read_only(np.eye(1 + len(COMMANDS), dtype=np.float32)[:, 1:])
+
+
+class VectorTables(NamedTuple):
+    """What `make_vectors` looks up."""
+
+    slices: dict[str, slice]  # where the entries are in a vector
+    width: int  # V
+    appearance: AppearanceTables
+    lane_sprite: np.ndarray  # (N,) the first sprite of the lane's figure in them
+    large: bool  # whether any agent is large enough to hide a tile
+
+
+def make_vector_tables(variant: MortarVariant, figures: tuple[Figure, ...], figure: np.ndarray) -> VectorTables:
+    """The tables for lanes whose agents are figures[figure], figure (N,)."""
+    views = len(symbols()) if variant.clue else 1  # of each figure
+    return VectorTables(
+        vector_slices(variant.entries),
+        sum(row.width for row in variant.entries),
+        appearance_tables(figures, variant.clue),
+        figure * (views * FACINGS),
+        any(2 * each.reach > TILE for each in figures),  # one that is no wider than a tile cannot hide one
+    )
+
+
+@lru_cache(maxsize=16)
+def appearance_tables(figures: tuple[Figure, ...], clue: bool) -> AppearanceTables:
+    """What shows of these figures behind every symbol; without a clue, behind none."""
+    free = ~symbol_masks() if clue else ~symbol_masks()[:1]
+    views = []
+    for figure in figures:
+        around = (figure.reach + 1) // 2 if figure.torus else 0
+        reach = range(PAD - around, PAD + SCREEN + around + 1)
+        image, solid = sprites(figure.scale)
+        views += [View(figure.scale, image, solid, each, reach, reach) for each in free]
+    return make_appearance_tables(views)
+
+
+@cache
+def symbol_masks() -> np.ndarray:
+    """(10, SCREEN, SCREEN) bool, read-only: where each symbol is drawn."""
+    masks = np.zeros((len(symbols()), SCREEN, SCREEN), bool)
+    square = slice(SYMBOL_AT, SYMBOL_AT + SYMBOL)
+    masks[:, square, square] = symbols()[:, :, ::3] > 0
+    return read_only(masks)
+
+
+@cache
+def floor_entries() -> np.ndarray:
+    """(F, 4) float32, read-only: arena, fire and safe tile of every floor."""
+    size, fire = np.array([(size / ARENA_SIZES[-1], tile is not None) for size, tile in FLOORS]).T
+    safe = (tile_tables().corner - PAD + TILE // 2) / SCREEN * fire[:, None]
+    return read_only(np.column_stack([size, fire, safe]).astype(np.float32))
+
+
+def make_vectors(s: State, tables: VectorTables, lanes: np.ndarray | slice) -> np.ndarray:
+    """Fresh vector observations of the lanes, (n, V) float32."""
+    at = tables.slices
+    sprite = tables.lane_sprite[lanes] + s.facing[lanes]  # (n,)
+    out = np.empty((len(sprite), tables.width), np.float32)
+    if "command" in at:
+        symbol = s.symbol[lanes]
+        sprite += symbol * FACINGS
+        out[:, at["command"]] = COMMAND_ENTRIES.take(symbol, axis=0)
+    else:
+        out[:, at["commands"]] = s.vector[lanes]
+    write_agent_entries(out[:, at["size"].start : at["facing"].stop], tables.appearance, sprite, s.pos[lanes])
+    floor = out[:, at["arena"].start : at["safe"].stop]  # (n, 4)
+    floor[:] = floor_entries().take(s.floor[lanes], axis=0)
+    if tables.large:
+        hide_floor(floor, s, lanes, sprite, tables.appearance)
+    return out
+
+
+def hide_floor(
+    out: np.ndarray, s: State, lanes: np.ndarray | slice, sprite: np.ndarray, tables: AppearanceTables
+) -> None:
+    """Clears the floor's entries (n, 4) of what large agents hide, in place.
+
+    It checks eight pixels alone: the corners of the arena and of the target tile. The arena shows if one of its corners
+    does, the fire if one of these burns, the safe tile if one of its own corners does.
+    """
+    size = s.size[lanes]
+    first = first_pixel(size) + PAD  # (n,)
+    arena = first[:, None, None] + CORNERS * (TILE * size - 1)[:, None, None]  # (n, 4, 2)
+    tile = s.target_corner[lanes][:, None] + CORNERS * (TILE - 1)  # (n, 4, 2)
+    points = np.concatenate([arena, tile], axis=1)  # (n, 8, 2)
+    x, y = np.moveaxis(points - PAD, -1, 0)
+    shown = ~covered(tables, sprite, s.pos[lanes], points) & ~symbol_masks()[s.symbol[lanes][:, None], y, x]  # (n, 8)
+    shows_fire = shown[:, :4] & (arena != tile).any(axis=-1)
+    out[:, 0] *= shown[:, :4].any(axis=1)
+    out[:, 1:] *= shows_fire.any(axis=1)[:, None]
+    out[:, 2:] *= shown[:, 4:].any(axis=1)[:, None]
