@@ -20,7 +20,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, befo
 import memory_gym_envs  # noqa: F401 (registers the ids)
 from memory_gym_envs.character import FACINGS, PAD, agent_tables, free_controls, grid_controls, walk
 from memory_gym_envs.drawing import SCREEN
-from memory_gym_envs.mystery_path import MAP_STRIDES, PIT, PIT_ROWS, TILE_AT
+from memory_gym_envs.mystery_path.rules import TILE_AT
+from memory_gym_envs.mystery_path.state import MAP_STRIDES, PIT, PIT_ROWS
 
 THESIS = {  # mean, standard deviation, minimum, maximum, levels
     "SearingSpotlights-v0": (33.36, 7.56, 14, 63, 100_000),

@@ -29,7 +29,7 @@ import memory_gym_envs
 import ppo_gru
 import ppo_trxl
 from memory_gym_envs.character import PAD
-from memory_gym_envs.mystery_path import ROWS
+from memory_gym_envs.mystery_path.state import ROWS
 from ppo_utils.checkpoints import make_agent
 from ppo_utils.environments import as_tensors, envs_for, is_memory_gym
 from ppo_utils.evaluation import most_probable

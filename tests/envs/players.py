@@ -5,7 +5,8 @@ import numpy as np
 
 import memory_gym_envs
 from memory_gym_envs import MysteryPath, SearingSpotlights
-from memory_gym_envs.mystery_path import EAST, WEST, tile_centres
+from memory_gym_envs.mystery_path.drawing import tile_centres
+from memory_gym_envs.mystery_path.state import EAST, WEST
 from memory_gym_envs.searing_spotlights import AGENT, COIN, EXIT, GONE
 
 TILE, SCREEN = 14, 84

@@ -9,22 +9,10 @@ from players import player, stumbling, turn_or_walk
 
 from memory_gym_envs import MysteryPath
 from memory_gym_envs.character import BODY, PAD
-from memory_gym_envs.mystery_path import (
-    EAST,
-    FIRST_SEGMENTS,
-    NORTH,
-    PIT,
-    PIT_ROWS,
-    ROWS,
-    SEGMENT,
-    SIDE,
-    SOUTH,
-    TILE,
-    WEST,
-    read_ahead,
-    sample_segments,
-    trail,
-)
+from memory_gym_envs.mystery_path.levels import FIRST_SEGMENTS, read_ahead, sample_segments
+from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE
+from memory_gym_envs.mystery_path.rules import trail
+from memory_gym_envs.mystery_path.state import EAST, NORTH, PIT, PIT_ROWS, ROWS, SOUTH, WEST
 
 EACH = pytest.mark.parametrize("env_id", MysteryPath.variants)
 FINITE = pytest.mark.parametrize("env_id", ["MysteryPath-v0", "MysteryPath-Grid-v0"])

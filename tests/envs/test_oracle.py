@@ -9,7 +9,7 @@ from players import FAMILY, player
 
 import memory_gym_envs
 from memory_gym_envs import MortarMayhem, MysteryPath
-from memory_gym_envs.mystery_path import EAST, NORTH, SOUTH, WEST
+from memory_gym_envs.mystery_path.state import EAST, NORTH, SOUTH, WEST
 
 # Table 4.4, but for the act tasks: the thesis' formula says 18 to 234 and 6 to 78 there. The original itself, whose
 # first command has one step more than the others, needs one step more; behind a clue the reset makes up for it.

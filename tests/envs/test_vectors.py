@@ -17,7 +17,8 @@ from memory_gym_envs.character import FACINGS, PAD
 from memory_gym_envs.entries import vector_slices, vector_space
 from memory_gym_envs.mortar_mayhem.arena import COMMANDS
 from memory_gym_envs.mortar_mayhem.drawing import SYMBOL, SYMBOL_AT
-from memory_gym_envs.mystery_path import PIT_ROWS, ROWS, SIDE
+from memory_gym_envs.mystery_path.options import SIDE
+from memory_gym_envs.mystery_path.state import PIT_ROWS, ROWS
 from memory_gym_envs.searing_spotlights import AGENT, COIN, EXIT
 
 LANES, STEPS = 48, 120

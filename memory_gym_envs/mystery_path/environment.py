@@ -1,0 +1,295 @@
+"""The Mystery Path environments."""
+
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from memory_gym_envs.base import DEBUG_ZOOM, MemoryGymVectorEnv, limit_of, numbered
+from memory_gym_envs.character import (
+    PAD,
+    SPAN,
+    STRIDES,
+    Figure,
+    agent_tables,
+    free_controls,
+    grid_controls,
+    radius_of,
+    walk,
+)
+from memory_gym_envs.drawing import SCREEN, magnify
+from memory_gym_envs.mystery_path.drawing import CROSS, STAMINA_BAR, camera_columns, draw, draw_truth
+from memory_gym_envs.mystery_path.levels import FIRST_SEGMENTS, append_segment, sample_level, write_level
+from memory_gym_envs.mystery_path.options import SEGMENT, SHOWN, SIDE, TILE, VARIANTS
+from memory_gym_envs.mystery_path.rules import (
+    BRANCHES,
+    TILE_AT,
+    enter_tiles,
+    forget_trails,
+    put_back,
+    spend_stamina,
+    walk_endless,
+)
+from memory_gym_envs.mystery_path.state import FAST, MAP_STRIDES, NO_CELL, PIT, PIT_ROWS, ROWS, State, make_path_room
+from memory_gym_envs.mystery_path.vectors import ViewOptions, make_vector_tables, make_vectors
+from memory_gym_envs.state import empty
+
+GRID_SCALE = 0.25  # the agent's size in the grid id
+
+
+class MysteryPath(MemoryGymVectorEnv):
+    """Mystery Path (thesis 4.4): follow an invisible path by remembering where the agent fell off.
+
+    ## Description
+
+    A path leads over a grid of 7 x 7 tiles, from a random tile of one side to one of the opposite side. Neither the
+    path nor the grid is visible. An agent that steps off the path falls into a pit, which a red cross shows, and the
+    next step puts it back to the path's origin, whatever its action.
+
+    - `MysteryPath-v0`: free movement. `MysteryPath-Grid-v0`: tile by tile.
+    - `Endless-MysteryPath-v0`: the path goes on to the right without end, in segments of 7 columns and a transition
+      tile. The camera moves with the agent, which sees the path behind it but cannot walk left.
+
+    ## Action Space
+
+    `MultiDiscrete([3, 3])`:
+
+    | value | horizontal | vertical |
+    |---|---|---|
+    | 0 | none | none |
+    | 1 | left | up |
+    | 2 | right | down |
+
+    `Discrete(4)`, Grid id:
+
+    | value | action |
+    |---|---|
+    | 0 | nothing |
+    | 1 | turn left |
+    | 2 | turn right |
+    | 3 | one tile forward |
+
+    `Discrete(4)`, endless id:
+
+    | value | action |
+    |---|---|
+    | 0 | nothing |
+    | 1 | right |
+    | 2 | up |
+    | 3 | down |
+
+    ## Observation Space
+
+    With obs_type="pixels" `Box(0, 255, (84, 84, 3), uint8)`, rows first; with "grayscale" the same with one channel,
+    (84, 84, 1); with "vector" a flat float32 vector, which `docs/vectors.md` and `VARIANTS[id].entries` describe.
+
+    ## Rewards
+
+    `reward_goal` (1) at the goal, `reward_path_progress` (0.1, Grid 0) when any tile of the path but the origin and the
+    goal is reached for the first time, `reward_fall_off` (0) in the pit, and `reward_step` (0) at every step.
+
+    ## Episode End
+
+    Terminated at the goal. The endless id: terminated when the agent has reached no new tile for `stamina_level` (20)
+    steps (all tiles are new again after a fall), falls off in a column left of the rightmost one that it reached, or
+    falls off at the same place again. Truncated after `max_steps` steps (512, Grid 128, endless no limit), unless the
+    same step terminates.
+
+    ## Info
+
+    `ground_truth`: one-hot, the direction of the path's next tile from where the agent last was on the path: east,
+    north, south, west, (4,); at the goal, the direction that led there. Endless id: east, north, south, (3,); where the
+    path goes west, the direction stays as it was. At an episode's end also `reward`, `length`, `num_fails` and
+    `success`; in the endless id, instead of success, `tiles_visited` and `max_x`, the rightmost column of the path that
+    the agent reached.
+
+    ## Arguments
+
+    `gym.make(id, ...)` and `gym.make_vec(id, num_envs=N, ...)` take
+
+    | name | default | meaning |
+    |---|---|---|
+    | `render_mode` | None | "rgb_array": what the agent sees; "debug_rgb_array": 336 x 336, with the ground truth |
+    | `num_levels`, `start_level` | None, 0 | resets without a seed play one of so many levels, from the first on |
+    | `obs_type` | "pixels" | or "grayscale" (one channel), or "vector" |
+    | `options` | None | reset parameters that are the environment's defaults |
+    | `max_episode_steps` | None | truncates longer episodes |
+    | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
+
+    `reset(options={...})` takes the same reset parameters, a single environment for one episode. `docs/options.md` and
+    `VARIANTS[id].options` list them. Those marked * are lists, one entry of which is sampled at every reset.
+
+    ## Version History
+
+    - v0: as in memory-gym 1.0.2, except for the differences below.
+
+    ## References
+
+    Marco Pleines: Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games. Dissertation, TU
+    Dortmund University. Marco Pleines, Matthias Pallasch, Frank Zimmer, Mike Preuss: Memory Gym, arXiv:2309.17207.
+
+    ## Kept from the original, and differences
+
+    Kept from the original: the agent starts its radius away from the left and upper edge of its tile, so one of scale
+        0.48 or more starts beside the origin; the Grid id ignores agent_scale, the endless id show_origin. Steps are
+        cut off to whole pixels, a diagonal one to 2 pixels at the default speed. In the endless id the camera's
+        fraction of a pixel is cut off, the background jumps at speeds that do not divide 12, and the places where the
+        agent fell off count until the episode ends. Of the path's leftmost column that is shown behind the agent, only
+        one tile is drawn, and nothing is drawn while the agent is in the first column. Where the endless path goes
+        left, the agent cannot follow it.
+    Differences from the original: images are rows first; max_steps truncates; every id reports ground truth; wrong
+        options raise ValueError.
+    """
+
+    variants = VARIANTS
+    tables = ("_agent_tables", "_vector_tables")
+
+    def spaces(self) -> tuple[gym.Space, gym.Space]:
+        """The observation space of one lane with pixels, and its action space."""
+        free = not (self.variant.grid or self.variant.endless)
+        actions = gym.spaces.MultiDiscrete([3, 3]) if free else gym.spaces.Discrete(4)
+        return gym.spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8), actions
+
+    def allocate(self) -> None:
+        """Makes the state of N lanes."""
+        segments = FIRST_SEGMENTS + 1 if self.variant.endless else 1
+        self.state = empty(State, N=self.num_envs, P=SIDE * SIDE + 1, M=segments * SEGMENT * ROWS, T=0)
+        self.state.path_cell[:, PIT] = NO_CELL
+        self.figures = (self._figure(self.defaults),)  # the different ones of all lanes
+        self.view_options = (self._view_options(self.defaults),)  # likewise
+        self.place_tables()
+
+    def configure(self, lanes: np.ndarray) -> None:
+        """Takes over the options of the lanes, and the tables that all lanes' options need."""
+        s, values = self.state, self.settings[int(lanes[0])]
+        s.step_limit[lanes] = limit_of(values["max_steps"])
+        s.visual_feedback[lanes] = values["visual_feedback"]
+        s.radius[lanes] = radius_of(self._scale(values))
+        for what, option in SHOWN.items():
+            getattr(s, f"show_{what}")[lanes] = values.get(option, False)
+        shown = any(values.get(option, False) for what, option in SHOWN.items() if what != "past")
+        s.extras[lanes] = shown or values.get("agent_speed", 0.0) > FAST
+        s.reward_goal[lanes] = values.get("reward_goal", 0.0)
+        s.reward_fall_off[lanes] = values["reward_fall_off"]
+        s.reward_progress[lanes] = values["reward_path_progress"]
+        s.reward_step[lanes] = values["reward_step"]
+        s.stamina_level[lanes] = values.get("stamina_level", 1)
+        if self.variant.endless:
+            self._place_camera(lanes, values)
+        self.figures, s.figure[:] = numbered([self._figure(each) for each in self.settings])
+        self.view_options, s.view[:] = numbered([self._view_options(each) for each in self.settings])
+        self.place_tables()
+
+    def _place_camera(self, lanes: np.ndarray, values: dict[str, Any]) -> None:
+        """Takes over the endless id's options that the camera and what moves with it depend on."""
+        s, speed = self.state, int(values["agent_speed"])
+        s.camera[lanes] = TILE * values["camera_offset_scale"]
+        s.trail_columns[lanes] = int(values["camera_offset_scale"])
+        s.speed[lanes] = speed
+        s.ground_period[lanes] = speed * math.ceil(TILE / speed) if speed else 1
+        figure_x, cross_x = camera_columns(values)
+        s.figure_x[lanes], s.cross_x[lanes] = figure_x, cross_x
+        s.cross_fits[lanes] = cross_x < PAD + SCREEN - STAMINA_BAR * values["show_stamina"] + CROSS // 2
+
+    def _scale(self, values: dict[str, Any]) -> float:
+        return GRID_SCALE if self.variant.grid else values["agent_scale"]
+
+    def _figure(self, values: dict[str, Any]) -> Figure:
+        scale = self._scale(values)
+        if self.variant.grid:
+            return Figure(scale, TILE, 0, SCREEN, TILE // 2, False)
+        return Figure(scale, values["agent_speed"], 0, SCREEN, radius_of(scale), False)
+
+    def _view_options(self, values: dict[str, Any]) -> ViewOptions:
+        scale = self._scale(values)
+        if not self.variant.endless:
+            return ViewOptions(scale, None, 0, SCREEN)
+        figure_x, cross_x = camera_columns(values)
+        return ViewOptions(scale, figure_x, cross_x - figure_x, SCREEN - STAMINA_BAR * values["show_stamina"])
+
+    def place_tables(self) -> None:
+        """Looks up the tables that follow from the options, and where each lane's rows start in them."""
+        self._agent_tables = agent_tables(self.figures)
+        self._controls = grid_controls() if self.variant.grid else free_controls()
+        self._truths = np.eye(4)[:, : 3 if self.variant.endless else 4].copy()
+        self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
+        self._lane_map = np.arange(self.num_envs) * self.state.step_at.shape[1] + PIT_ROWS  # (N,)
+        self._lane_path = np.arange(self.num_envs) * self.state.path_cell.shape[1]  # (N,)
+        if self.obs_type == "vector":
+            self._vector_tables = make_vector_tables(self.variant.entries, self.view_options)
+
+    def begin(self, lanes: np.ndarray) -> None:
+        """Samples the lanes' next levels and starts their episodes."""
+        forget_trails(self.state, lanes)
+        for lane in lanes.tolist():
+            level = sample_level(self._rngs[lane], self.settings[lane], self.variant)
+            if make_path_room(self.state, len(level.path), len(level.walls)):
+                self.place_tables()
+            write_level(self.state, lane, level, self.variant.endless)
+
+    def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """One step of the rules: walk, enter a tile or fall off, end. Returns rewards, terminated, truncated, (N,)."""
+        s, endless = self.state, self.variant.endless
+        s.length += 1
+        action = actions if actions.ndim == 1 else actions.dot(BRANCHES)  # (N,)
+        if np.count_nonzero(s.fallen):
+            action = put_back(s, action)
+        if endless:
+            walk_endless(s, action)
+            s.tile = (s.pos - PAD) // TILE  # (N, 2)
+            self._extend_paths()
+        else:
+            s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._agent_tables.walk)
+            s.tile = TILE_AT.take(s.pos)  # (N, 2)
+        cell = s.tile.dot(MAP_STRIDES) + self._lane_map  # (N,)
+        before, s.path_step = s.path_step, s.step_at.take(cell)
+        s.fallen = s.path_step == PIT
+        rewards = s.reward_step.copy()
+        landed = int(np.count_nonzero(s.path_step != before))
+        if landed:
+            enter_tiles(s, self._lane_path, rewards, endless)
+        terminated = spend_stamina(s, cell, landed) if endless else s.path_step == s.path_length
+        if not endless and np.count_nonzero(terminated):
+            rewards += terminated * s.reward_goal
+        s.episode_return += rewards
+        truncated = s.length == s.step_limit
+        if np.count_nonzero(truncated):
+            truncated &= ~terminated
+        return rewards, terminated, truncated
+
+    def _extend_paths(self) -> None:
+        """Appends a segment to the paths whose last segment the agent just entered."""
+        s = self.state
+        entered = s.tile[:, 0] >= (s.segments - 1) * SEGMENT
+        if not np.count_nonzero(entered):
+            return
+        for lane in np.flatnonzero(entered).tolist():
+            if append_segment(s, lane, self._rngs[lane]):
+                self.place_tables()
+
+    def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh vector observations of the lanes, (n, V) float32."""
+        return make_vectors(self.state, self._vector_tables, lanes, self.variant.endless)
+
+    def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh frames of the lanes, (n, 84, 84, 3) uint8."""
+        return draw(self.state, self._agent_tables.sheet, lanes, self.variant.endless)
+
+    def ground_truth(self) -> np.ndarray:
+        """The direction of the path's next tile: a fresh one-hot (N, 4), endless (N, 3)."""
+        return self._truths.take(self.state.next_direction, axis=0)
+
+    def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
+        """The lanes' ended episodes in numbers, each (n,)."""
+        s = self.state
+        numbers = {"reward": s.episode_return[lanes], "length": s.length[lanes]}
+        if self.variant.endless:
+            places = {"max_x": s.max_column[lanes], "tiles_visited": s.visited[lanes]}
+            return numbers | {"num_fails": s.fails[lanes]} | places
+        success = (s.path_step[lanes] == s.path_length[lanes]).astype(np.int64)
+        return numbers | {"success": success, "num_fails": s.fails[lanes]}
+
+    def annotate(self, frame: np.ndarray, lane: int) -> None:
+        """Draws the path in white, its origin and transition tiles blue, its goal green, walls red, then the agent."""
+        frame[:] = magnify(draw_truth(self.state, self._agent_tables.sheet, lane, self.variant.endless), DEBUG_ZOOM)

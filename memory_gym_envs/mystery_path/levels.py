@@ -1,0 +1,225 @@
+"""Mystery Path's levels: walls, a path around them, and the start of an episode on it.
+
+A level is sampled on grids of 7 x 7 places, one for each segment. A place is column * SIDE + row.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from memory_gym_envs.character import PAD
+from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE
+from memory_gym_envs.mystery_path.state import (
+    DIRECTIONS,
+    EAST,
+    NO_STEP,
+    PIT,
+    PIT_ROWS,
+    ROWS,
+    UNREWARDED,
+    State,
+    make_path_room,
+)
+from memory_gym_envs.variant import Variant
+from memory_gym_envs.words import WordBuffer, below, pick
+
+FIRST_SEGMENTS = 3  # of an endless path; another is appended whenever the agent enters the last one
+
+PLACES = [divmod(place, SIDE) for place in range(SIDE * SIDE)]
+CELLS = [column * ROWS + PIT_ROWS + row for column, row in PLACES]
+STRAIGHT = ((1, 0), (-1, 0), (0, 1), (0, -1))  # in the original's order
+OBLIQUE = ((1, 1), (-1, -1), (1, -1), (-1, 1))
+
+
+def _neighbours(x: int, y: int, moves: tuple[tuple[int, int], ...]) -> list[int]:
+    spots = [(x + dx, y + dy) for dx, dy in moves]
+    return [spot[0] * SIDE + spot[1] for spot in spots if spot in PLACES]
+
+
+NEIGHBOURS = [_neighbours(x, y, STRAIGHT) for x, y in PLACES]
+DISTANCES = [[math.sqrt((a - x) ** 2 + (b - y) ** 2) for a, b in PLACES] for x, y in PLACES]
+
+# Places that may become walls. A set of border places is an integer, with a bit for each of the 24.
+INSIDE = [place for place, (x, y) in enumerate(PLACES) if 0 < x < SIDE - 2 and 0 < y < SIDE - 2]
+BORDER = [place for place, spot in enumerate(PLACES) if 0 in spot or SIDE - 1 in spot]
+
+
+def _border_bits(places: list[int]) -> int:
+    return sum(1 << at for at, place in enumerate(BORDER) if place in places)
+
+
+# Border places that stay free because of a place: at most a step away from a start or end, next to or at the corners of
+# a wall.
+NEAR_END = [_border_bits(_neighbours(x, y, ((0, 0), *STRAIGHT))) for x, y in PLACES]
+AROUND_WALL = [_border_bits(_neighbours(x, y, STRAIGHT + OBLIQUE)) for x, y in PLACES]
+# CANDIDATES[i][bits]: those of the border's places 8 * i to 8 * i + 7 that may become walls while the set bits may not.
+CANDIDATES = [
+    [[BORDER[first + at] for at in range(8) if not bits >> at & 1] for bits in range(256)] for first in (0, 8, 16)
+]
+CLOSED, UNREACHED = 0, 1 << 20  # in place of a cost
+
+WALL_PERCENT = 33  # the chance of a wall inside
+BORDER_WALLS = (4, 8)  # how many walls the border may have
+# Draws of a path, at most: origin's side, start, end, the walls inside, how many and which of the border, and the cost
+# between each two neighbours.
+DRAWS = 3 + len(INSIDE) + 1 + 8 + 2 * SIDE * (SIDE - 1)
+SPARE_DRAWS = 7  # for numbers that have to be drawn again, one in ten million
+
+
+class Level(NamedTuple):
+    """What the generator decides at a reset, and for every further segment of an endless path."""
+
+    path: list[int]  # its cells, from the origin to the goal
+    walls: list[list[int]]  # the places of each segment that the path avoids
+
+
+def read_ahead(rng: np.random.Generator, paths: int) -> WordBuffer:
+    """The words that sampling so many paths may take. Asking the generator for one at a time is slow."""
+    return WordBuffer(rng, paths * (DRAWS + SPARE_DRAWS))
+
+
+def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
+    """Samples a level. It draws in the original's order, so that a seed builds the same level."""
+    buffer = read_ahead(rng, FIRST_SEGMENTS if variant.endless else 1)
+    if variant.endless:
+        level = sample_segments(buffer, below(buffer, SIDE), 0, FIRST_SEGMENTS)
+    else:
+        side = pick(buffer, values["cardinal_origin_choice"])
+        start, end = below(buffer, SIDE), below(buffer, SIDE)
+        near, far = (0, SIDE - 1) if side in (0, 2) else (SIDE - 1, 0)
+        if side in (0, 1):
+            start, end = near * SIDE + start, far * SIDE + end
+        else:
+            start, end = start * SIDE + near, end * SIDE + far
+        walls = sample_walls(buffer, start, end)
+        level = Level(cells_of(sample_path(buffer, walls, start, end), 0), [walls])
+    buffer.close()
+    return level
+
+
+def sample_segments(buffer: WordBuffer, row: int, first: int, count: int) -> Level:
+    """Samples `count` segments of an endless path, which starts in this row of segment number `first`."""
+    path, every_wall = [], []
+    for segment in range(first, first + count):
+        start, end = row, (SIDE - 1) * SIDE + below(buffer, SIDE)
+        walls = sample_walls(buffer, start, end)
+        path += cells_of(sample_path(buffer, walls, start, end), segment)
+        path.append(path[-1] + ROWS)  # the transition tile
+        every_wall.append(walls)
+        row = end % SIDE
+    return Level(path, every_wall)
+
+
+def sample_walls(buffer: WordBuffer, start: int, end: int) -> list[int]:
+    """The places that the path avoids: some inside, and some on the border that touch neither those nor start and end.
+
+    So there always is a path: along the border, and one ring further inside past the walls of the border.
+    """
+    walls, kept_free = buffer.sample_each(INSIDE, WALL_PERCENT), NEAR_END[start] | NEAR_END[end]
+    for place in walls:
+        kept_free |= AROUND_WALL[place]
+    border = CANDIDATES[0][kept_free & 255] + CANDIDATES[1][kept_free >> 8 & 255] + CANDIDATES[2][kept_free >> 16]
+    return walls + buffer.take_random(border, BORDER_WALLS[below(buffer, 2)])
+
+
+def sample_path(buffer: WordBuffer, walls: list[int], start: int, end: int) -> list[int]:
+    """The path that A* finds over random costs, not always the cheapest: its places from start to end."""
+    costs, used, distance = buffer.eighths, buffer.used, DISTANCES[end]
+    cost, total, previous = [UNREACHED] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
+    for place in walls:
+        cost[place] = CLOSED
+    opened, first, here, so_far = [], None, start, 1
+    while here != end:
+        cost[here] = CLOSED
+        for place in NEIGHBOURS[here]:
+            if cost[place]:
+                there = so_far + costs[used]  # a cost of 1 to 8
+                used += 1
+                if cost[place] == UNREACHED:
+                    cost[place], total[place], previous[place] = there, there + distance[place], here
+                    opened.append(place)
+                elif there < cost[place]:
+                    # The original leaves the higher cost as it is.
+                    previous[place] = here
+        # As in the original, the next place is not the one of the least total. It is the first one in the queue whose
+        # total is below that of the queue's first, or else the queue's first itself. So while that stays first, the
+        # places that were passed over need no second comparison.
+        if first is None:
+            waiting, passed = iter(opened), []
+            first = next(waiting)
+            least = total[first]
+        for here in waiting:
+            if total[here] < least:
+                break
+            passed.append(here)
+        else:
+            here, first, opened = first, None, passed
+        so_far = cost[here] + 1
+    buffer.used = used
+    return trace_back(previous, start, end)
+
+
+def trace_back(previous: list[int], start: int, end: int) -> list[int]:
+    """The places from start to end, where previous[place] is the place before each."""
+    path = [end]
+    while path[-1] != start:
+        path.append(previous[path[-1]])
+    return path[::-1]
+
+
+def cells_of(places: list[int], segment: int) -> list[int]:
+    """The map's cells of this segment's places."""
+    shift = segment * SEGMENT * ROWS
+    return [CELLS[place] + shift for place in places]
+
+
+def write_level(s: State, lane: int, level: Level, endless: bool) -> None:
+    """Starts the lane's episode at this level, for which there must be room."""
+    s.step_at[lane] = PIT
+    s.fell_at[lane] = s.walls[lane] = s.fallen[lane] = s.shows_cross[lane] = False
+    s.path_length[lane] = s.segments[lane] = s.max_column[lane] = s.fails[lane] = s.visited[lane] = 0
+    s.length[lane] = s.episode_return[lane] = 0
+    write_path(s, lane, level, endless)
+    s.reached[lane] = 0
+    s.reached[lane, PIT] = s.reached[lane, 1] = UNREWARDED
+    if not endless:
+        s.reached[lane, len(level.path)] = UNREWARDED  # the goal has a reward of its own
+    column, row = divmod(level.path[0] - PIT_ROWS, ROWS)
+    # As in the original, this is the middle of the tile only for an agent of the default size.
+    radius = int(s.radius[lane])
+    x, y = column * TILE + radius, row * TILE + radius
+    s.pos[lane] = s.origin[lane] = x + PAD, y + PAD
+    s.tile[lane] = x // TILE, y // TILE
+    s.facing[lane] = 6 if endless else 0
+    s.path_step[lane], s.last_path_step[lane] = NO_STEP, 1  # the first step lands on the origin
+    s.next_direction[lane] = s.direction_at[lane, 1]
+    s.stamina[lane] = s.stamina_level[lane]
+
+
+def write_path(s: State, lane: int, level: Level, endless: bool) -> None:
+    """Appends to the lane's path, for which there must be room."""
+    first = int(s.path_length[lane]) + 1
+    last = first + len(level.path)
+    s.path_cell[lane, first:last] = level.path
+    path = s.path_cell[lane, first:last]
+    s.step_at[lane][path] = np.arange(first, last)
+    s.direction_at[lane, first : last - 1] = DIRECTIONS[path[1:] - path[:-1]]
+    # After a transition tile the path goes on to the right. At the goal, the direction is the one that leads to it.
+    s.direction_at[lane, last - 1] = EAST if endless else s.direction_at[lane, last - 2]
+    s.path_length[lane] = last - 1
+    for segment, walls in enumerate(level.walls, int(s.segments[lane])):
+        s.walls[lane, cells_of(walls, segment)] = True
+    s.segments[lane] += len(level.walls)
+
+
+def append_segment(s: State, lane: int, rng: np.random.Generator) -> bool:
+    """Appends a segment to the lane's endless path. Returns whether the state's arrays had to be widened."""
+    steps, segments = int(s.path_length[lane]), int(s.segments[lane])
+    row = int(s.path_cell[lane, steps]) % ROWS - PIT_ROWS
+    buffer = read_ahead(rng, 1)
+    level = sample_segments(buffer, row, segments, 1)
+    buffer.close()
+    widened = make_path_room(s, steps + len(level.path), segments + 1)
+    write_path(s, lane, level, endless=True)
+    return widened

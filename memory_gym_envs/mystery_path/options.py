@@ -1,0 +1,83 @@
+"""The ids of Mystery Path: their tiles, reset options and entries of a vector observation."""
+
+from memory_gym_envs.appearance import LARGEST_RADIUS, agent_entries
+from memory_gym_envs.character import PAD, SPAN
+from memory_gym_envs.drawing import SCREEN
+from memory_gym_envs.entries import Entries
+from memory_gym_envs.options import Option
+from memory_gym_envs.variant import Variant, agent_scale, agent_speed, max_steps, present
+
+TILE = 12  # pixels
+SIDE = 7  # tiles along one side of the screen, and of a segment of the endless path
+SEGMENT = SIDE + 1  # columns of a segment and the transition tile behind it
+
+SHOWN = {  # by the options that show something: the state has a field show_... for each
+    "origin": "show_origin",
+    "goal": "show_goal",
+    "past": "show_past_path",
+    "ground": "show_background",
+    "stamina": "show_stamina",
+}
+
+
+def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
+    """The reset options of an id, in the original's order."""
+    steps, progress = -1 if endless else 128 if grid else 512, 0.0 if grid else 0.1
+    ignored = "ignored, as in the original"
+    origin = ignored if endless else "show the path's origin in blue"
+    sides = "where the path starts: 0 left, 1 right, 2 top, 3 bottom"
+    camera = "how many tiles from the screen's left edge the agent is drawn"
+    rows = [
+        (True, max_steps(steps)),
+        (True, agent_scale(f"; {ignored}" if grid else "")),
+        (not grid, agent_speed()),
+        (not endless, Option("cardinal_origin_choice", (0, 1, 2, 3), "ints", 0, 3, f"{sides} *")),
+        (True, Option("show_origin", False, "bool", None, None, origin)),
+        (not endless, Option("show_goal", False, "bool", None, None, "show the path's goal in green")),
+        (endless, Option("show_past_path", True, "bool", None, None, "show the path behind the agent in white")),
+        (endless, Option("show_background", False, "bool", None, None, "show tiles that move as the agent walks")),
+        (endless, Option("show_stamina", False, "bool", None, None, "show how much stamina is left")),
+        (True, Option("visual_feedback", True, "bool", None, None, "show a red cross where the agent falls off")),
+        (endless, Option("camera_offset_scale", 5.0, "float", 0.0, 5.5, camera)),
+        (endless, Option("stamina_level", 20, "int", 1, None, "steps until the agent must have reached a new tile")),
+        (not endless, Option("reward_goal", 1.0, "float", None, None, "reward for reaching the goal")),
+        (True, Option("reward_fall_off", 0.0, "float", None, None, "reward for falling off the path")),
+        (True, Option("reward_path_progress", progress, "float", None, None, "reward for each new tile of the path")),
+        (True, Option("reward_step", 0.0, "float", None, None, "reward for every step")),
+    ]
+    return present(rows)
+
+
+def _entries(endless: bool) -> tuple[Entries, ...]:
+    """The entries of an id's vector observation."""
+    cross = Entries("cross", 1, "1: a red cross is seen, where the agent fell off")
+    if not endless:
+        places = [
+            Entries(name, 2, f"the centre of the path's {name}, x and y, / 84 pixels; zeros: not shown, or hidden")
+            for name in ("origin", "goal")
+        ]
+        return *agent_entries(0, SCREEN + LARGEST_RADIUS), cross, *places
+    past = (
+        "1: a tile of the path behind the agent shows, by column and then row; its left edge is in one of 8 columns of "
+        "12 pixels, the first of which is left of the screen"
+    )
+    return (
+        *agent_entries(-PAD, SPAN - 1 - PAD),
+        cross,
+        Entries("past", SEGMENT * SIDE, past),
+        Entries("scroll", 1, "how far right of its column's left edge each of them starts, at most, / 12 pixels"),
+        Entries("ground", 1, "one more than how far left the background has moved, / 12 pixels; 0: there is none"),
+        Entries("bar", 1, "1: the stamina bar is there"),
+        Entries("stamina", 1, "how much of it is green"),
+    )
+
+
+def _variant(render_fps: int, grid: bool = False, endless: bool = False) -> Variant:
+    return Variant(render_fps, _options(grid, endless), _entries(endless), grid, endless)
+
+
+VARIANTS = {
+    "MysteryPath-v0": _variant(25),
+    "MysteryPath-Grid-v0": _variant(3, grid=True),
+    "Endless-MysteryPath-v0": _variant(25, endless=True),
+}
