@@ -407,14 +407,6 @@ def numbered(every: list[Any]) -> tuple[tuple[Any, ...], list[int]]:
     return different, [different.index(each) for each in every]
 
 
-def widened(array: np.ndarray, width: int, filler: float = 0) -> np.ndarray:
-    """The same array with room for at least `width` along its last axis."""
-    missing = width - array.shape[-1]
-    if missing <= 0:
-        return array
-    return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, missing)], constant_values=filler)
-
-
 def limit_of(steps: int) -> int:
     """The number of steps that an option allows, of which -1 means any."""
     return NO_LIMIT if steps == -1 else steps
@@ -466,9 +458,9 @@ def grayscale_space(space: gym.Space) -> gym.Space:
     """The space with one channel instead of three in each picture."""
     if isinstance(space, gym.spaces.Dict):
         return gym.spaces.Dict({key: grayscale_space(each) for key, each in space.items()})
-    if space.dtype != np.uint8:
+    if not isinstance(space, gym.spaces.Box) or space.dtype != np.uint8:
         return space
-    return gym.spaces.Box(0, 255, (*space.shape[:2], 1), np.uint8)  # type: ignore[index]
+    return gym.spaces.Box(0, 255, (*space.shape[:2], 1), np.uint8)
 
 
 def grayscale_pictures(observations: Any) -> Any:

@@ -28,7 +28,7 @@ def empty(kind: type[State], **sizes: int) -> State:
 
 def grows(state: Any, name: str) -> bool:
     """Whether this array of the state grows along its last axis."""
-    axis = type(state).__dataclass_fields__[name].metadata.get("axes", "N")[-1]
+    axis = type(state).__dataclass_fields__[name].metadata["axes"][-1]
     return isinstance(axis, str) and axis != "N"
 
 
