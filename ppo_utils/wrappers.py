@@ -20,15 +20,10 @@ from memory_gym_envs.bits import pixels
 from memory_gym_envs.drawing import FRAME, SCREEN, gray
 from memory_gym_envs.options import brief, complete_options
 from memory_gym_envs.saving import Saved
-from memory_gym_envs.searing_spotlights import (
-    SPEED,
-    TIME,
-    VARIANTS,
-    SearingSpotlights,
-    light_masks,
-    spot_places,
-    spot_stencils,
-)
+from memory_gym_envs.searing_spotlights import VARIANTS, SearingSpotlights
+from memory_gym_envs.searing_spotlights.drawing import light_masks, spot_stencils
+from memory_gym_envs.searing_spotlights.rules import spot_places
+from memory_gym_envs.searing_spotlights.state import SPEED, TIME
 
 OBSERVATION = "observation"  # the name of an observation that is no Dict, where it becomes a part of one
 STEP_ENCODING, LAST_ACTION = "step_encoding", "last_action"  # parts of a Dict that the wrappers add

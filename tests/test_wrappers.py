@@ -12,7 +12,7 @@ from gymnasium.wrappers import FrameStackObservation, TransformObservation
 from players import choices
 
 from memory_gym_envs.drawing import gray
-from memory_gym_envs.searing_spotlights import BEND, START, TOWARD
+from memory_gym_envs.searing_spotlights.state import BEND, START, TOWARD
 from ppo_utils.wrappers import (
     FourierFeatures,
     GrayscaleStack,

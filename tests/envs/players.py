@@ -7,7 +7,7 @@ import memory_gym_envs
 from memory_gym_envs import MysteryPath, SearingSpotlights
 from memory_gym_envs.mystery_path.drawing import tile_centres
 from memory_gym_envs.mystery_path.state import EAST, WEST
-from memory_gym_envs.searing_spotlights import AGENT, COIN, EXIT, GONE
+from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE
 
 TILE, SCREEN = 14, 84
 FAMILY = {env_id: family for family in memory_gym_envs.FAMILIES for env_id in family.variants}

@@ -14,7 +14,7 @@ from memory_gym_envs import IDS
 from memory_gym_envs.character import DIAGONAL_FORTH, PAD, SPAN, STRIDES, Figure, sprites, walk_table
 from memory_gym_envs.drawing import ring
 from memory_gym_envs.options import complete_options
-from memory_gym_envs.searing_spotlights import draw_coins_and_exits
+from memory_gym_envs.searing_spotlights.drawing import draw_coins_and_exits
 
 CROWD = {"spawn_interval": 1, "spot_min_speed": 1e-5, "spot_max_speed": 1e-4, "spot_damage": 0.0, "steps_per_coin": -1}
 

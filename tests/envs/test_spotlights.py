@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from players import player
 
-from memory_gym_envs.searing_spotlights import AGENT, COIN, EXIT, GONE, RADIUS, REACH, SIGHT, SPEED, TIME
+from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, RADIUS, REACH, SIGHT, SPEED, TIME
 
 FINITE, ENDLESS = "SearingSpotlights-v0", "Endless-SearingSpotlights-v0"
 SAFE = {"spot_damage": 0}

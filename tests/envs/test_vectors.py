@@ -19,7 +19,7 @@ from memory_gym_envs.mortar_mayhem.arena import COMMANDS
 from memory_gym_envs.mortar_mayhem.drawing import SYMBOL, SYMBOL_AT
 from memory_gym_envs.mystery_path.options import SIDE
 from memory_gym_envs.mystery_path.state import PIT_ROWS, ROWS
-from memory_gym_envs.searing_spotlights import AGENT, COIN, EXIT
+from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT
 
 LANES, STEPS = 48, 120
 OPTIONS = {  # played one after the other, each by the ids that have its options

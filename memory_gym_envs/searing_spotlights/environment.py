@@ -1,0 +1,309 @@
+"""Searing Spotlights as a batch of lanes."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from memory_gym_envs.base import DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, limit_of, numbered
+from memory_gym_envs.bits import PLACE_0, PLACES, pixel_scratch
+from memory_gym_envs.character import PAD, SPAN, STRIDES, Figure, agent_tables, free_controls, radius_of, walk
+from memory_gym_envs.drawing import GREEN, SCREEN, magnify, ring
+from memory_gym_envs.searing_spotlights.drawing import (
+    TOP_BAR,
+    DrawingTables,
+    bars,
+    coin_and_exit_sheet,
+    draw,
+    draw_in_full_light,
+    draw_scenery,
+    set_pictures,
+    spot_stencils,
+)
+from memory_gym_envs.searing_spotlights.levels import sample_coin, sample_level, sample_spot, write_level
+from memory_gym_envs.searing_spotlights.options import VARIANTS
+from memory_gym_envs.searing_spotlights.rules import (
+    add_spot,
+    burn,
+    count_step,
+    leave,
+    move_spots,
+    place_coin,
+    set_rules,
+    take_coins,
+    touched_bodies,
+)
+from memory_gym_envs.searing_spotlights.state import AGENT, COIN, RADIUS, State
+from memory_gym_envs.searing_spotlights.vectors import make_vectors, vector_tables
+from memory_gym_envs.state import empty, make_room
+from memory_gym_envs.words import words
+
+
+class SearingSpotlights(MemoryGymVectorEnv):
+    """Searing Spotlights (thesis 4.5): collect coins and leave in the dark, away from wandering spotlights.
+
+    ## Description
+
+    The light goes out in the first steps. Spotlights wander over the dark screen and show what is in them; each step in
+    one costs the agent health. It has to collect the coins and to leave through the exit, which opens only then.
+    It must remember where things were, and where it has walked since it was last visible. A bar at the top shows
+    health, the action before the last, and whether the step before the last was rewarded.
+
+    - `SearingSpotlights-v0`: one coin and the exit; a new spotlight every 40 steps.
+    - `Endless-SearingSpotlights-v0`: one coin after the other, each visible for a moment and to be collected within 160
+      steps; a new spotlight every 50 steps, twice the health, no exit.
+
+    ## Action Space
+
+    `MultiDiscrete([3, 3])`:
+
+    | value | horizontal | vertical |
+    |---|---|---|
+    | 0 | none | none |
+    | 1 | left | up |
+    | 2 | right | down |
+
+    ## Observation Space
+
+    `Box(0, 255, (84, 84, 3), uint8)`, rows first. With obs_type="grayscale" the same pictures in one channel,
+    (84, 84, 1). With obs_type="vector" a flat float32 vector: `docs/vectors.md`, `VARIANTS[id].entries`.
+
+    ## Rewards
+
+    `reward_coin` (0.25) for a coin, `reward_exit` (1) for leaving, and in every step `reward_inside_spotlight` or
+    `reward_outside_spotlight` (both 0); `reward_death` (0) is added when no health is left.
+
+    ## Episode End
+
+    Terminated when no health is left, when the agent leaves or, without an exit, takes the last coin; in the endless id
+    after `steps_per_coin` steps without a coin. Truncated after `max_steps` steps, unless it terminates in that step.
+    An agent that knows everything needs 14 to 63 steps for the finite task, 33 on average (table 4.5).
+
+    ## Info
+
+    `ground_truth` (6,): x and y of the agent, of the first coin left and of the exit; the endless id (4,) without the
+    exit. In pixels over 84, so an agent that starts outside the screen has up to 86 / 84; 0 for what is not there. At
+    an episode's end also `reward`, `length`, `agent_health` (share left, negative if the last hit took more than that),
+    `coins_collected` (a share, 1 if there were none; in the endless id a number) and, in the finite id, `success`.
+
+    ## Arguments
+
+    `gym.make(id, ...)` and `gym.make_vec(id, num_envs=N, ...)` take
+
+    | name | default | meaning |
+    |---|---|---|
+    | `render_mode` | None | "rgb_array": what the agent sees; "debug_rgb_array": 336 x 336, with the ground truth |
+    | `num_levels`, `start_level` | None, 0 | resets without a seed play one of so many levels, from the first on |
+    | `obs_type` | "pixels" | or "grayscale": one channel; or "vector" |
+    | `options` | None | reset parameters that are the environment's defaults |
+    | `max_episode_steps` | None | truncates longer episodes |
+    | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
+
+    `reset(options={...})` takes the same reset parameters, in a single environment for one episode. `docs/options.md`
+    and `VARIANTS[id].options` list them. Those marked * are lists, one entry of which is sampled at every reset.
+    Radii and speeds of spotlights are sampled between their smallest and largest.
+
+    ## Version History
+
+    - v0: as in memory-gym 1.0.2, except for the differences below.
+
+    ## References
+
+    Marco Pleines: Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games. Dissertation, TU
+    Dortmund University. Marco Pleines, Matthias Pallasch, Frank Zimmer, Mike Preuss: Memory Gym, arXiv:2309.17207.
+
+    ## Kept from the original, and differences
+
+    Kept from the original: the bar shows the action and the reward of the step before the last. A spotlight behind one
+    that is removed skips that step, and so does a coin behind a taken one when several are touched at once. The wait
+    for the next spotlight is always the first of the planned intervals, as each spawn removes the last one; so
+    spawn_interval_decay changes nothing, and neither does reward_max_steps. All coins but the first are a step old when
+    they are first shown, so in the dark they are visible in one frame less than `coin_show_duration` says. Radii of
+    spotlights are whole pixels, from spot_min_radius to spot_max_radius, both rounded down. The agent may start under
+    the bar or outside the screen and steps inside with its first step; before that it is drawn facing up, and no
+    spotlight shines. Dying at the exit is no success, though it pays. An endless task's coin may appear on the agent.
+    Small coins (scale below 0.5) are all rim and small exits all frame. Whether what is visible in the dark is drawn
+    above the bar or below it depends on what else is visible.
+
+    Differences from the original: images are rows first; max_steps truncates; the finite id reports ground truth; what
+    an episode drew or painted black or white does not show in the next one; no exit, no coins and a hidden action bar
+    work; the share of no coins is 1, not NaN; coins for which no free pixel is left are put anywhere; a smallest radius
+    or speed above the largest replaces it; `coin_enabled` is new; wrong options raise ValueError.
+    """
+
+    variants = VARIANTS
+    tables = ("_agent_tables", "_drawing", "_vector_tables")
+    truth_high = (SCREEN + 2) / SCREEN  # an agent may start that far outside of the screen
+    kept = (*MemoryGymVectorEnv.kept, "_unlocked")
+
+    def spaces(self) -> tuple[gym.Space, gym.Space]:
+        """The observation space of one lane with pixels, and its action space."""
+        return gym.spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8), gym.spaces.MultiDiscrete([3, 3])
+
+    def allocate(self) -> None:
+        """Makes the state of N lanes, with room for no coin and one spotlight."""
+        self.state = empty(State, N=self.num_envs, S=1, B=COIN, R=2 * self.num_envs)
+        self._number_sprites()
+        self._unlocked: list[int] = []  # lanes without coins, whose exits open in the first step
+        self.place_tables()
+
+    def configure(self, lanes: np.ndarray) -> None:
+        """Takes over the options of the lanes, and the tables that all lanes' options need."""
+        values, endless = self.settings[int(lanes[0])], self.variant.endless
+        make_room(self.state, "B", COIN + (1 if endless else max((1, *values["num_coins"]))))
+        set_rules(self.state, lanes, values, endless)
+        set_pictures(self.state, lanes, values)
+        self._number_sprites()
+        self.place_tables()
+
+    def _number_sprites(self) -> None:
+        """Numbers the different figures, coins and exits of all lanes' options."""
+        self.figures, figure = numbered([figures_of(values) for values in self.settings])
+        self.scales, scale = numbered([scales_of(values) for values in self.settings])
+        # There are two of each figure, for x and y: the bar makes the ground less high than wide.
+        self.state.figure[:] = [2 * each for each in figure]
+        self.state.coin_sprite[:] = [3 * each for each in scale]
+
+    def place_tables(self) -> None:
+        """The tables that step() looks things up in, and where each lane's rows start in them."""
+        self._agent_tables = agent_tables(tuple(figure for pair in self.figures for figure in pair))
+        every = [values[name] for values in self.settings for name in ("spot_min_radius", "spot_max_radius")]
+        radii = int(min(every)), int(max(every))
+        self._drawing = DrawingTables(
+            spots=spot_stencils(*radii),
+            figures=self._agent_tables.sheet,
+            coins_and_exits=coin_and_exit_sheet(self.scales),
+            bars=bars(self.variant.endless),
+            scratch=pixel_scratch(self.num_envs),
+        )
+        if self.obs_type == "vector":
+            figure_scales = tuple(across.scale for across, _ in self.figures)
+            has_hands = [int(10 * values["agent_scale"]) > 0 for values in self.settings]
+            self._vector_tables = vector_tables(self.state, self.variant, radii, figure_scales, self.scales, has_hands)
+        self._controls = free_controls()
+        self._calm = np.arange(0, 2 * self.num_envs, 2)  # (N,) the scenery's calm rows
+        self._lane_walk = (self.state.figure[:, None] + np.arange(2)) * (STRIDES * SPAN)  # (N, 2)
+
+    def begin(self, lanes: np.ndarray) -> None:
+        """Samples the lanes' next levels and starts their episodes."""
+        for lane in lanes.tolist():
+            values = self.settings[lane]
+            spawns = NO_LIMIT if self.variant.endless else limit_of(values["num_spawns"])
+            level = sample_level(self._rngs[lane], values, self.variant)
+            write_level(self.state, lane, level, spawns)
+            self._draw_scenery(lane)
+            if not level.coins:
+                self._unlocked.append(lane)
+
+    def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """One step of the rules: walk, spawn, shine, burn, collect, leave."""
+        s, endless = self.state, self.variant.endless
+        s.length += 1
+        self._move(actions)
+        self._unlock()
+        self._spawn()
+        hit = move_spots(s)
+        rewards, terminated, s.floor = s.reward_outside.copy(), np.zeros(self.num_envs, bool), self._calm.copy()
+        if np.count_nonzero(hit):
+            burn(s, np.flatnonzero(hit), rewards, terminated)
+        touched = touched_bodies(s)
+        if np.count_nonzero(touched):
+            self._collect(touched, rewards)
+            if not endless:
+                leave(s, touched, rewards, terminated)
+        return rewards, terminated, count_step(s, rewards, terminated, endless)
+
+    def _move(self, actions: np.ndarray) -> None:
+        s = self.state
+        action = actions[:, 0] * 3 + actions[:, 1]  # (N,)
+        s.shown_action, s.last_action = s.last_action, action
+        s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._agent_tables.walk)
+        s.drawn_facing = s.facing
+        np.subtract(s.pos.T, PAD, out=s.bodies[:, :, AGENT])
+
+    def _unlock(self) -> None:
+        """Opens the exits of levels without coins."""
+        while self._unlocked:
+            lane = self._unlocked.pop()
+            self.state.is_open[lane] = self.state.coins_left[lane] == 0
+            self._draw_scenery(lane)
+
+    def _spawn(self) -> None:
+        """Adds the spotlights that are due."""
+        s = self.state
+        s.spawn_wait -= 1
+        due = s.spawn_wait == 0
+        if np.count_nonzero(due):
+            for lane in np.flatnonzero(due).tolist():
+                add_spot(s, lane, sample_spot(self._rngs[lane], self.settings[lane]))
+
+    def _collect(self, touched: np.ndarray, rewards: np.ndarray) -> None:
+        """Takes the coins that are touched, (N, B) bool; the endless id then has a new one."""
+        s = self.state
+        for lane in np.flatnonzero(touched[:, COIN:].any(axis=1)).tolist():
+            last = tuple(s.bodies[:, lane, COIN].tolist())
+            rewards[lane] += s.reward_coin[lane] * take_coins(s, lane, touched[lane])
+            if self.variant.endless:
+                place_coin(s, lane, sample_coin(words(self._rngs[lane]), last))
+            self._draw_scenery(lane)
+
+    def _draw_scenery(self, lane: int) -> None:
+        """Draws the lane's scenery again. Vectors need none; frames() draws it then."""
+        if self.obs_type != "vector":
+            draw_scenery(self.state, self._drawing, lane)
+
+    def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh frames of the lanes, (n, 84, 84, 3)."""
+        if self.obs_type == "vector":
+            for lane in np.arange(self.num_envs)[lanes].tolist():
+                draw_scenery(self.state, self._drawing, lane)
+        return draw(self.state, self._drawing, lanes)
+
+    def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
+        """Fresh vector observations of the lanes, (n, V) float32: see VARIANTS[id].entries."""
+        return make_vectors(self.state, self._vector_tables, lanes)
+
+    def ground_truth(self) -> np.ndarray:
+        """A fresh (N, 6), or (N, 4) in the endless id: the agent's, the coin's and the exit's x and y, over 84."""
+        s = self.state
+        truth = np.empty((self.num_envs, 4 if self.variant.endless else 6))
+        truth[:, :2] = s.bodies[:, :, AGENT].T
+        truth[:, 2:] = s.targets[:, : truth.shape[1] - 2]
+        truth /= SCREEN
+        return truth
+
+    def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
+        """The lanes' ended episodes in numbers."""
+        s = self.state
+        numbers = {"reward": s.episode_return[lanes], "length": s.length[lanes]}
+        numbers["agent_health"] = (s.health / s.full_health)[lanes]
+        if self.variant.endless:
+            return numbers | {"coins_collected": s.collected[lanes]}
+        coins = s.num_coins[lanes]
+        share = np.where(coins > 0, s.collected[lanes] / np.maximum(coins, 1), 1.0)
+        return numbers | {"coins_collected": share, "success": s.success[lanes]}
+
+    def annotate(self, frame: np.ndarray, lane: int) -> None:
+        """Lights everything below the bar, and circles the spotlights."""
+        s, lanes = self.state, np.array([lane])
+        lit = draw_in_full_light(s, self._drawing, lanes, True)
+        below = slice(TOP_BAR * DEBUG_ZOOM, None)
+        frame[below] = magnify(lit.reshape(SCREEN, SCREEN, 3), DEBUG_ZOOM)[below]
+        for slot in np.flatnonzero(s.spot_place[0, lane]).tolist():
+            radius = int(s.spots[RADIUS, lane, slot])
+            x, y = (s.spot_place[:, lane, slot] - radius * PLACES - PLACE_0).tolist()
+            circle = ring(len(frame), x * DEBUG_ZOOM, y * DEBUG_ZOOM, radius * DEBUG_ZOOM, DEBUG_ZOOM)
+            circle[: TOP_BAR * DEBUG_ZOOM] = False
+            frame[circle] = GREEN
+
+
+def figures_of(values: dict[str, Any]) -> tuple[Figure, Figure]:
+    """The agent's figure as it walks across and as it walks down, where the bar is in its way."""
+    scale, speed = values["agent_scale"], values["agent_speed"]
+    across, down = (Figure(scale, speed, low, SCREEN, radius_of(scale), False) for low in (0, TOP_BAR))
+    return across, down
+
+
+def scales_of(values: dict[str, Any]) -> tuple[float, float]:
+    """The scales of coin and exit."""
+    return values["coin_scale"], values.get("exit_scale", values["coin_scale"])

@@ -1,0 +1,167 @@
+"""Levels: what the generator decides at a reset and when a coin or a spotlight appears.
+
+All is sampled in the original's order, so that a seed means the same level here.
+"""
+
+import math
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from memory_gym_envs.base import NO_LIMIT
+from memory_gym_envs.bits import PLACE_0, PLACES
+from memory_gym_envs.character import FACINGS, PAD, hand_places, radius_of
+from memory_gym_envs.drawing import SCREEN
+from memory_gym_envs.searing_spotlights.rules import update_targets
+from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, NO_KEY, NO_SPOT, RADIUS, State
+from memory_gym_envs.state import make_room
+from memory_gym_envs.variant import Variant
+from memory_gym_envs.words import below, pick, words
+
+MIDDLE = SCREEN // 2
+OUTSIDE = math.sqrt(2 * SCREEN**2) / 2  # spotlights start and end that far from the middle, and their radius more
+MARGIN = 7  # coins and the exit stay that far from the screen's edges
+AGENT_SPACE, COIN_SPACE = 28, 21  # pixels around a place where nothing else is put
+
+
+class Level(NamedTuple):
+    """A level. Places are x and y in pixels."""
+
+    facing: int
+    pos: tuple[int, int]  # the agent's
+    spots: list[list[float]]  # each a column of State.spots
+    coins: list[tuple[int, int]]
+    exit: tuple[int, int] | None
+
+
+def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
+    """Samples a level of the given options."""
+    word = words(rng)
+    facing = below(word, FACINGS)
+    if values["sample_agent_position"]:
+        pos, free = sample_place(word, None, AGENT_SPACE)
+    else:
+        pos = (MIDDLE, MIDDLE)
+        free = occupied(None, pos, COIN_SPACE)
+    spots = [sample_spot(rng, values) for _ in range(values["initial_spawns"])]
+    if variant.endless:
+        return Level(facing, pos, spots, [sample_coin(word, None)] if values["coin_enabled"] else [], None)
+    things = []
+    coins = pick(word, values["num_coins"]) if values["num_coins"] else 0
+    for _ in range(coins + values["use_exit"]):
+        place, free = sample_place(word, free, COIN_SPACE)
+        things.append(inside(place))
+    return Level(facing, pos, spots, things, things.pop() if values["use_exit"] else None)
+
+
+def sample_place(word: Callable[[], int], free: np.ndarray | None, space: int) -> tuple[tuple[int, int], np.ndarray]:
+    """A place near a free pixel, and which pixels are free once those around it are occupied.
+
+    free: (84, 84) bool, or None: every pixel is free. space: pixels around the place.
+    """
+    cells = () if free is None else np.flatnonzero(free)
+    # Where nothing is free, the original fails.
+    cell = int(cells[below(word, len(cells))]) if len(cells) else below(word, SCREEN * SCREEN)
+    y, x = divmod(cell, SCREEN)
+    return (x + 2 + below(word, 2), y + 2 + below(word, 2)), occupied(free, (x, y), space)
+
+
+def occupied(free: np.ndarray | None, pos: tuple[int, int], space: int) -> np.ndarray:
+    """Which pixels are free, (84, 84) bool, once those less than `space` away from the place are occupied.
+
+    free: (84, 84) bool, or None: every pixel is free.
+    """
+    left, top = SCREEN - 1 - pos[0], SCREEN - 1 - pos[1]
+    far = _distant(space)[top : top + SCREEN, left : left + SCREEN]
+    return far if free is None else free & far
+
+
+@cache
+def _distant(space: int) -> np.ndarray:
+    """(167, 167) bool: which pixels are at least `space` away from the central one."""
+    offset = np.arange(1 - SCREEN, SCREEN)
+    return offset**2 + offset[:, None] ** 2 >= space**2
+
+
+def inside(pos: tuple[int, int]) -> tuple[int, int]:
+    """The place, moved inside the screen's margin."""
+    x, y = (min(max(part, MARGIN), SCREEN - MARGIN) for part in pos)
+    return x, y
+
+
+def sample_coin(word: Callable[[], int], last: tuple[int, int] | None) -> tuple[int, int]:
+    """The endless task's next coin, away from the last one. It may lie under the agent, as in the original."""
+    free = None if last is None else occupied(None, last, AGENT_SPACE)
+    return inside(sample_place(word, free, AGENT_SPACE)[0])
+
+
+def sample_spot(rng: np.random.Generator, values: dict[str, Any]) -> list[float]:
+    """A new spotlight, a column of State.spots. Its path is bent, from one side of the screen to roughly the other."""
+    word = words(rng)
+    least, slowest = int(values["spot_min_radius"]), values["spot_min_speed"]
+    radius = least + below(word, max(int(values["spot_max_radius"]) - least, 0) + 1)
+    speed = rng.uniform(slowest, max(slowest, values["spot_max_speed"]))
+    start = below(word, 360)
+    target = start + 180 - 45 + below(word, 90)
+    offset = target - 135 + below(word, 270)
+    far = OUTSIDE + radius
+    x, y = (MIDDLE + far * part for part in UNITS[start])
+    to_x, to_y = (MIDDLE + far * part for part in UNITS[target])
+    off_x, off_y = (MIDDLE + far * part for part in UNITS[offset])
+    reach, sight = radius + radius_of(values["agent_scale"]), radius + _extent(values["agent_scale"])
+    path = [x, y, to_x - x, to_y - y, off_x - to_x, off_y - to_y]
+    return [0.0, speed, radius, reach * reach, sight * sight, *path]
+
+
+@cache
+def _extent(scale: float) -> float:
+    """How far from the agent's centre a spotlight may end and still show some of it, in pixels."""
+    hands = max(math.hypot(*place) for facing in range(FACINGS) for place in hand_places(scale, facing))
+    return max(radius_of(scale), hands + int(10 * scale)) + 3  # as both are drawn at whole pixels
+
+
+def _unit(degrees: int) -> tuple[float, float]:
+    """The direction of an angle; quarter turns are exact."""
+    if degrees % 90 == 0:
+        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[degrees // 90 % 4]
+    angle = math.fmod(degrees * math.pi / 180, 2 * math.pi)
+    return math.cos(angle), math.sin(angle)
+
+
+UNITS = [_unit(degrees) for degrees in range(720)]
+
+
+def write_level(s: State, lane: int, level: Level, spawns: int) -> None:
+    """Starts the lane's episode at this level. spawns: how many spotlights will follow."""
+    coins, spots = len(level.coins), len(level.spots)
+    if spots > s.spot_key.shape[1]:
+        make_room(s, "S", spots)
+    # Before the first step the agent is drawn facing up wherever it faces, as in the original.
+    if s.drawn_facing is s.facing:
+        s.drawn_facing = s.drawn_facing.copy()
+    s.facing[lane], s.drawn_facing[lane] = level.facing, 0
+    s.bodies[:, lane] = GONE
+    s.bodies[:, lane, AGENT] = level.pos
+    for axis in range(2):
+        s.pos[lane, axis] = level.pos[axis] + PAD
+    for coin, place in enumerate(level.coins):
+        s.bodies[:, lane, COIN + coin] = place
+    s.targets[lane] = 0.0
+    if level.exit is not None:
+        s.bodies[:, lane, EXIT] = s.targets[lane, 2:] = level.exit
+    s.num_coins[lane] = s.coins_left[lane] = coins
+    update_targets(s, lane)
+    s.spots[:, lane], s.spot_key[lane], s.num_spots[lane] = NO_SPOT[:, None], NO_KEY, spots
+    if spots:
+        s.spots[:, lane, :spots] = np.array(level.spots).T
+        s.spot_key[lane, :spots] = [spot[RADIUS] * PLACES + PLACE_0 for spot in level.spots]
+    s.spot_place[:, lane], s.near_light[lane] = 0, False  # they shine from the first step on
+    s.spawns_left[lane], s.spawn_wait[lane] = spawns, s.spawn_interval[lane] if spawns else NO_LIMIT
+    s.health[lane] = s.full_health[lane]
+    s.floor[lane] = 2 * lane
+    for field in (s.collected, s.coin_age, s.success, s.is_open, s.lost_width, s.length):
+        field[lane] = 0
+    s.last_action[lane] = s.shown_action[lane] = s.shown_gain[lane] = 0
+    s.last_gain[lane], s.episode_return[lane] = 1, 0.0
