@@ -35,8 +35,10 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = (["gymnasium", "numpy", "pygame"], ["--no-deps", "memory-gym==1.0.2"])
 LONGEST = 500  # steps of an episode
 KINDS = ("crash", "reward", "end", "info", "ground truth", "command vector", "frame")
-NOT_COMPARED = """Left out:
-  coin_enabled, which is new; num_spawns above 1000, of which the original makes a list
+NEW = ("coin_enabled", "coin_feedback", "spawn_delay")  # options that the original lacks
+NOT_COMPARED = f"""Left out:
+  {", ".join(NEW)}, which are new
+  num_spawns above 1000, of which the original makes a list
   a smallest radius or speed above the largest
   ground truth of ids for which the original has none; debug frames, which show other things here"""
 
@@ -100,10 +102,10 @@ def make_original(folder: str) -> str:
 
 
 def draw_options(rng: np.random.Generator, table: tuple[Any, ...]) -> dict[str, Any]:
-    """Reset options: each of the table's with the same chance, which is drawn as well."""
+    """Reset options: each of the table's that the original has, with the same chance, which is drawn as well."""
+    table = tuple(option for option in table if option.name not in NEW)
     chance, defaults = rng.choice([0.0, 0.1, 0.3, 1.0]), {option.name: option.default for option in table}
     values = {option.name: draw_value(rng, option) for option in table if rng.random() < chance}
-    values.pop("coin_enabled", None)
     if "num_spawns" in values:
         values["num_spawns"] = min(values["num_spawns"], 1000)
     for pair in (("spot_min_radius", "spot_max_radius"), ("spot_min_speed", "spot_max_speed")):

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memory_gym_envs.base import NO_LIMIT, limit_of
+from memory_gym_envs.base import NO_LIMIT
 from memory_gym_envs.bits import NO_SHAPE, Stencils, pixels, stencils
 from memory_gym_envs.character import FACINGS
 from memory_gym_envs.drawing import (
@@ -169,7 +169,6 @@ def _arch(size: int, corner: int) -> np.ndarray:
 def set_pictures(s: State, lanes: np.ndarray, values: dict[str, Any]) -> None:
     """Writes what the options mean for the pictures to the state of these lanes, (n,)."""
     coins, exit_, agent = values["coins_visible"], values.get("exit_visible", False), values["agent_visible"]
-    s.coin_show_limit[lanes] = NO_LIMIT if coins else limit_of(values.get("coin_show_duration", 0))
     plain = WHITE_FLOOR if values["hide_chessboard"] else BLUE_FLOOR
     alarm = RED_FLOOR if plain == BLUE_FLOOR and values["visual_feedback"] else plain
     s.rim[lanes] = values["black_background"]

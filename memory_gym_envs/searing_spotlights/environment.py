@@ -20,11 +20,12 @@ from memory_gym_envs.searing_spotlights.drawing import (
     set_pictures,
     spot_stencils,
 )
-from memory_gym_envs.searing_spotlights.levels import sample_coin, sample_level, sample_spot, write_level
+from memory_gym_envs.searing_spotlights.levels import sample_coin, sample_delay, sample_level, sample_spot, write_level
 from memory_gym_envs.searing_spotlights.options import VARIANTS
 from memory_gym_envs.searing_spotlights.rules import (
     add_spot,
     burn,
+    coin_show_limit,
     count_step,
     leave,
     move_spots,
@@ -100,8 +101,8 @@ class SearingSpotlights(MemoryGymVectorEnv):
     | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
 
     `reset(options={...})` takes the same reset parameters, in a single environment for one episode. `docs/options.md`
-    and `VARIANTS[id].options` list them. Those marked * are lists, one entry of which is sampled at every reset.
-    Radii and speeds of spotlights are sampled between their smallest and largest.
+    and `VARIANTS[id].options` list them. Those marked * are lists, one entry of which is sampled at every reset, or
+    for each interval. Radii and speeds of spotlights are sampled between their smallest and largest.
 
     ## Version History
 
@@ -128,7 +129,11 @@ class SearingSpotlights(MemoryGymVectorEnv):
     Differences from the original: images are rows first; max_steps truncates; the finite id reports ground truth; what
     an episode drew or painted black or white does not show in the next one; no exit, no coins and a hidden action bar
     work; the share of no coins is 1, not NaN; coins for which no free pixel is left are put anywhere; a smallest radius
-    or speed above the largest replaces it; `coin_enabled` is new; wrong options raise ValueError.
+    or speed above the largest replaces it; wrong options raise ValueError.
+
+    Options that the original lacks: `coin_enabled`; `coin_feedback`, as what follows a coin tells the agent where it is
+    (thesis 7.3.3, 8.3.1): without it, the next coin stays in the dark until light falls on it, and the bar doesn't show
+    the coin's reward; `spawn_delay`, for spotlights at random intervals (7.3.3).
     """
 
     variants = VARIANTS
@@ -190,7 +195,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
             values = self.settings[lane]
             spawns = NO_LIMIT if self.variant.endless else limit_of(values["num_spawns"])
             level = sample_level(self._rngs[lane], values, self.variant)
-            write_level(self.state, lane, level, spawns)
+            write_level(self.state, lane, level, spawns, coin_show_limit(values, first=True))
             self._draw_scenery(lane)
             if not level.coins:
                 self._unlocked.append(lane)
@@ -206,12 +211,12 @@ class SearingSpotlights(MemoryGymVectorEnv):
         rewards, terminated, s.floor = s.reward_outside.copy(), np.zeros(self.num_envs, bool), self._calm.copy()
         if np.count_nonzero(hit):
             burn(s, np.flatnonzero(hit), rewards, terminated)
-        touched = touched_bodies(s)
+        touched, shown = touched_bodies(s), {}
         if np.count_nonzero(touched):
-            self._collect(touched, rewards)
+            shown = self._collect(touched, rewards)
             if not endless:
                 leave(s, touched, rewards, terminated)
-        return rewards, terminated, count_step(s, rewards, terminated, endless)
+        return rewards, terminated, count_step(s, rewards, terminated, shown, endless)
 
     def _move(self, actions: np.ndarray) -> None:
         s = self.state
@@ -235,17 +240,25 @@ class SearingSpotlights(MemoryGymVectorEnv):
         due = s.spawn_wait == 0
         if np.count_nonzero(due):
             for lane in np.flatnonzero(due).tolist():
-                add_spot(s, lane, sample_spot(self._rngs[lane], self.settings[lane]))
+                rng, values = self._rngs[lane], self.settings[lane]
+                add_spot(s, lane, sample_spot(rng, values), sample_delay(rng, values))
 
-    def _collect(self, touched: np.ndarray, rewards: np.ndarray) -> None:
-        """Takes the coins that are touched, (N, B) bool; the endless id then has a new one."""
-        s = self.state
+    def _collect(self, touched: np.ndarray, rewards: np.ndarray) -> dict[int, float]:
+        """Takes the coins that are touched, (N, B) bool; the endless id then has a new one.
+
+        rewards: (N,), changed in place. Returns those that the top bar shows instead, by lane, without coin_feedback.
+        """
+        s, shown = self.state, {}
         for lane in np.flatnonzero(touched[:, COIN:].any(axis=1)).tolist():
-            last = tuple(s.bodies[:, lane, COIN].tolist())
+            last, values = tuple(s.bodies[:, lane, COIN].tolist()), self.settings[lane]
+            if self.variant.endless and not values["coin_feedback"]:
+                shown[lane] = float(rewards[lane])
             rewards[lane] += s.reward_coin[lane] * take_coins(s, lane, touched[lane])
             if self.variant.endless:
-                place_coin(s, lane, sample_coin(words(self._rngs[lane]), last))
+                place = sample_coin(words(self._rngs[lane]), last)
+                place_coin(s, lane, place, coin_show_limit(values, first=False))
             self._draw_scenery(lane)
+        return shown
 
     def _draw_scenery(self, lane: int) -> None:
         """Draws the lane's scenery again. Vectors need none; frames() draws it then."""

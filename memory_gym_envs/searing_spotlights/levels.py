@@ -10,11 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memory_gym_envs.base import NO_LIMIT
 from memory_gym_envs.bits import PLACE_0, PLACES
 from memory_gym_envs.character import FACINGS, PAD, hand_places, radius_of
 from memory_gym_envs.drawing import SCREEN
-from memory_gym_envs.searing_spotlights.rules import update_targets
+from memory_gym_envs.searing_spotlights.rules import start_wait, update_targets
 from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, NO_KEY, NO_SPOT, RADIUS, State
 from memory_gym_envs.state import make_room
 from memory_gym_envs.variant import Variant
@@ -34,6 +33,7 @@ class Level(NamedTuple):
     spots: list[list[float]]  # each a column of State.spots
     coins: list[tuple[int, int]]
     exit: tuple[int, int] | None
+    delay: int  # steps added to the first interval between spotlights
 
 
 def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
@@ -47,13 +47,15 @@ def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Vari
         free = occupied(None, pos, COIN_SPACE)
     spots = [sample_spot(rng, values) for _ in range(values["initial_spawns"])]
     if variant.endless:
-        return Level(facing, pos, spots, [sample_coin(word, None)] if values["coin_enabled"] else [], None)
+        coin = [sample_coin(word, None)] if values["coin_enabled"] else []
+        return Level(facing, pos, spots, coin, None, sample_delay(rng, values))
     things = []
     coins = pick(word, values["num_coins"]) if values["num_coins"] else 0
     for _ in range(coins + values["use_exit"]):
         place, free = sample_place(word, free, COIN_SPACE)
         things.append(inside(place))
-    return Level(facing, pos, spots, things, things.pop() if values["use_exit"] else None)
+    exit_ = things.pop() if values["use_exit"] else None
+    return Level(facing, pos, spots, things, exit_, sample_delay(rng, values))
 
 
 def sample_place(word: Callable[[], int], free: np.ndarray | None, space: int) -> tuple[tuple[int, int], np.ndarray]:
@@ -115,6 +117,11 @@ def sample_spot(rng: np.random.Generator, values: dict[str, Any]) -> list[float]
     return [0.0, speed, radius, reach * reach, sight * sight, *path]
 
 
+def sample_delay(rng: np.random.Generator, values: dict[str, Any]) -> int:
+    """The steps added to the next interval between spotlights. A list of one takes no draw."""
+    return pick(words(rng), values["spawn_delay"])
+
+
 @cache
 def _extent(scale: float) -> float:
     """How far from the agent's centre a spotlight may end and still show some of it, in pixels."""
@@ -133,8 +140,11 @@ def _unit(degrees: int) -> tuple[float, float]:
 UNITS = [_unit(degrees) for degrees in range(720)]
 
 
-def write_level(s: State, lane: int, level: Level, spawns: int) -> None:
-    """Starts the lane's episode at this level. spawns: how many spotlights will follow."""
+def write_level(s: State, lane: int, level: Level, spawns: int, show_limit: int) -> None:
+    """Starts the lane's episode at this level.
+
+    spawns: how many spotlights will follow. show_limit: age until which coins are visible in the dark, in steps.
+    """
     coins, spots = len(level.coins), len(level.spots)
     if spots > s.spot_key.shape[1]:
         make_room(s, "S", spots)
@@ -152,13 +162,15 @@ def write_level(s: State, lane: int, level: Level, spawns: int) -> None:
     if level.exit is not None:
         s.bodies[:, lane, EXIT] = s.targets[lane, 2:] = level.exit
     s.num_coins[lane] = s.coins_left[lane] = coins
+    s.coin_show_limit[lane] = show_limit
     update_targets(s, lane)
     s.spots[:, lane], s.spot_key[lane], s.num_spots[lane] = NO_SPOT[:, None], NO_KEY, spots
     if spots:
         s.spots[:, lane, :spots] = np.array(level.spots).T
         s.spot_key[lane, :spots] = [spot[RADIUS] * PLACES + PLACE_0 for spot in level.spots]
     s.spot_place[:, lane], s.near_light[lane] = 0, False  # they shine from the first step on
-    s.spawns_left[lane], s.spawn_wait[lane] = spawns, s.spawn_interval[lane] if spawns else NO_LIMIT
+    s.spawns_left[lane] = spawns
+    start_wait(s, lane, level.delay)
     s.health[lane] = s.full_health[lane]
     s.floor[lane] = 2 * lane
     for field in (s.collected, s.coin_age, s.success, s.is_open, s.lost_width, s.length):

@@ -8,6 +8,7 @@ from memory_gym_envs.variant import Variant, agent_scale, agent_speed, max_steps
 
 SPOT_RADII = (1, 42)  # pixels; the largest spotlight is as wide as the screen
 MOST_COINS = 20
+LONGEST_DELAY = 1000  # steps
 UNUSED = "ignored, as in the original"
 
 
@@ -15,6 +16,7 @@ def light_rows(endless: bool) -> list[tuple[bool, Option]]:
     """The options of time and light, each with whether the id has it."""
     finite, (small, large), least = not endless, SPOT_RADII, "; {} where that is larger"
     deadline = "steps to collect a coin in; -1: no limit"
+    delay = "steps added to an interval between spotlights, sampled for each *"
     return [
         (True, max_steps(-1 if endless else 256)),
         (endless, Option("steps_per_coin", 160, "int", 1, None, deadline, also=(-1,))),
@@ -24,6 +26,7 @@ def light_rows(endless: bool) -> list[tuple[bool, Option]]:
         (finite, Option("spawn_interval_threshold", 10, "int", 0, None, "steps added to initial_spawn_interval")),
         (finite, Option("spawn_interval_decay", 0.95, "float", 0.0, 1.0, UNUSED)),
         (endless, Option("spawn_interval", 50, "int", 1, None, "steps between the spotlights that follow")),
+        (True, Option("spawn_delay", (0,), "ints", 0, LONGEST_DELAY, delay)),
         (True, Option("spot_min_radius", 7.5, "float", small, large, "smallest radius of a spotlight, rounded down")),
         (True, Option("spot_max_radius", 13.75, "float", small, large, "largest" + least.format("the smallest"))),
         (True, Option("spot_min_speed", 0.0025, "float", 0.0, 1.0, "slowest spotlight, in passages a step")),
@@ -40,10 +43,12 @@ def light_rows(endless: bool) -> list[tuple[bool, Option]]:
 def body_rows(endless: bool) -> list[tuple[bool, Option]]:
     """The options of coins, exit, agent and rewards, likewise."""
     finite, shown = not endless, "frames that show the first coin in the dark; each later one: one frame less"
+    feedback = "false: later coins appear in the dark, and the top bar doesn't show rewards for coins"
     return [
         (finite, Option("num_coins", (1,), "ints", 0, MOST_COINS, "coins to collect *", empty=True)),
         (True, Option("coin_scale", 0.375, "float", 0.1, 2.0, "size of a coin; 0.375: 6 pixels wide")),
         (endless, Option("coin_show_duration", 6, "int", 0, None, shown)),
+        (endless, Option("coin_feedback", True, "bool", None, None, feedback)),
         (True, Option("coins_visible", False, "bool", None, None, "coins are visible in the dark")),
         (endless, Option("coin_enabled", True, "bool", None, None, "false: no coins, and no time limit for them")),
         (finite, Option("use_exit", True, "bool", None, None, "false: the last coin ends the episode")),
@@ -89,7 +94,7 @@ def entry_rows(endless: bool) -> tuple[Entries, ...]:
 
 
 def make_variant(endless: bool) -> Variant:
-    """The finite id, or the endless one: one coin after the other, no exit. Options in the original's order."""
+    """The finite id, or the endless one: one coin after the other, no exit. The original's options are in its order."""
     options = present(light_rows(endless) + body_rows(endless))
     return Variant(25, options, entry_rows(endless), endless=endless)
 

@@ -56,8 +56,8 @@ def set_rules(s: State, lanes: np.ndarray, values: dict[str, Any], endless: bool
 # ---- spotlights ----
 
 
-def add_spot(s: State, lane: int, spot: list[float]) -> None:
-    """Adds a spotlight, a column of State.spots, to the lane and starts the wait for the next one."""
+def add_spot(s: State, lane: int, spot: list[float], delay: int) -> None:
+    """Adds a spotlight, a column of State.spots, to the lane's. delay: steps added to the wait for the next one."""
     at = int(s.num_spots[lane])
     if at == s.spot_key.shape[1]:
         # Every step reads all slots, so there are few spare ones, unless so many are in use that growing costs more.
@@ -66,8 +66,13 @@ def add_spot(s: State, lane: int, spot: list[float]) -> None:
     s.spot_key[lane, at] = spot[RADIUS] * PLACES + PLACE_0
     s.num_spots[lane] = at + 1
     s.spawns_left[lane] -= 1
+    start_wait(s, lane, delay)
+
+
+def start_wait(s: State, lane: int, delay: int) -> None:
+    """Starts the wait for the lane's next spotlight, of the interval and so many steps more."""
     # Always the first interval of the original's list, as its spawns remove the last one.
-    s.spawn_wait[lane] = s.spawn_interval[lane] if s.spawns_left[lane] else NO_LIMIT
+    s.spawn_wait[lane] = s.spawn_interval[lane] + delay if s.spawns_left[lane] else NO_LIMIT
 
 
 def spot_places(spots: np.ndarray) -> np.ndarray:
@@ -161,10 +166,17 @@ def take_coins(s: State, lane: int, touched: np.ndarray) -> int:
     return taken
 
 
-def place_coin(s: State, lane: int, place: tuple[int, int]) -> None:
-    """Puts the endless task's next coin there, x and y in pixels."""
+def coin_show_limit(values: dict[str, Any], first: bool) -> int:
+    """The age until which coins are visible in the dark, in steps. first: of an episode's first coins, or the next."""
+    if values["coins_visible"]:
+        return NO_LIMIT
+    return values.get("coin_show_duration", 0) if first or values["coin_feedback"] else 0
+
+
+def place_coin(s: State, lane: int, place: tuple[int, int], show_limit: int) -> None:
+    """Puts the endless task's next coin there, x and y in pixels. show_limit: as in write_level."""
     s.bodies[:, lane, COIN] = place
-    s.coins_left[lane], s.coin_age[lane] = 1, 0
+    s.coins_left[lane], s.coin_age[lane], s.coin_show_limit[lane] = 1, 0, show_limit
     update_targets(s, lane)
 
 
@@ -189,11 +201,18 @@ def leave(s: State, touched: np.ndarray, rewards: np.ndarray, terminated: np.nda
 # ---- counting ----
 
 
-def count_step(s: State, rewards: np.ndarray, terminated: np.ndarray, endless: bool) -> np.ndarray:
-    """Counts the step; (N,) bool which episodes are truncated. terminated (N,) changes in place."""
+def count_step(
+    s: State, rewards: np.ndarray, terminated: np.ndarray, shown: dict[int, float], endless: bool
+) -> np.ndarray:
+    """Counts the step; (N,) bool which episodes are truncated. terminated (N,) changes in place.
+
+    shown: by lane, rewards that the top bar shows instead of the lane's own.
+    """
     if endless:
         s.coin_age += 1
         terminated |= s.coin_age == s.coin_limit
     s.shown_gain, s.last_gain = s.last_gain, (rewards > 0) + 1
+    for lane, reward in shown.items():
+        s.last_gain[lane] = 1 + (reward > 0)
     s.episode_return += rewards
     return (s.length == s.step_limit) & ~terminated

@@ -42,6 +42,7 @@ class State:
     coins_left: np.ndarray = array("N")  # of them
     collected: np.ndarray = array("N")  # coins so far
     coin_age: np.ndarray = array("N")  # steps since the coin appeared (endless)
+    coin_show_limit: np.ndarray = array("N")  # age until which the coin, or all of them, are visible in the dark
     success: np.ndarray = array("N")  # 1 when the task is done
     # The spotlights, oldest first; rows are TIME .. BEND.
     spots: np.ndarray = array(len(NO_SPOT), "N", "S", dtype=np.float64, fill=NO_SPOT[:, None, None])
@@ -65,8 +66,7 @@ class State:
     # Options that the rules or the pictures need at every step.
     step_limit: np.ndarray = array("N")  # steps until truncation
     coin_limit: np.ndarray = array("N")  # steps to collect a coin in
-    coin_show_limit: np.ndarray = array("N")  # age until which coins are visible in the dark
-    spawn_interval: np.ndarray = array("N")  # steps between spotlights
+    spawn_interval: np.ndarray = array("N")  # steps between spotlights, without the delay
     full_health: np.ndarray = array("N", dtype=np.float64)  # health at the start
     damage: np.ndarray = array("N", dtype=np.float64)
     floors: np.ndarray = array("N", 2)  # rows of floors(): while the agent is in the dark, and in the light

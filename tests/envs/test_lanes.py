@@ -24,12 +24,14 @@ OPTIONS = {
     "Endless-MysteryPath-v0": {"stamina_level": 15, "show_stamina": True, "show_background": True, "agent_speed": 4.6}
     | {"camera_offset_scale": 2.3},
     "SearingSpotlights-v0": {"num_coins": [0, 2, 4], "coin_scale": 0.6, "initial_spawns": 10, "black_background": True},
-    "Endless-SearingSpotlights-v0": {"steps_per_coin": 40, "light_threshold": 150, "agent_visible": True},
+    "Endless-SearingSpotlights-v0": {"steps_per_coin": 40, "light_threshold": 150, "agent_visible": True}
+    | {"coin_feedback": False},
 }
 CHANGED = {
     MortarMayhem: {"explosion_delay": [9], "agent_scale": 0.5},
     MysteryPath: {"reward_step": -0.5, "agent_scale": 0.4},
-    SearingSpotlights: {"spot_min_radius": 2.0, "spot_max_radius": 30, "initial_spawns": 9, "agent_scale": 0.5},
+    SearingSpotlights: {"spot_min_radius": 2.0, "spot_max_radius": 30, "initial_spawns": 9, "agent_scale": 0.5}
+    | {"spawn_delay": [0, 3, 8]},
 }
 
 

@@ -104,6 +104,9 @@ WRONG_SPOTLIGHTS = [
     ({"coin_scale": 0.0}, "'coin_scale'.*a number from 0.1 to 2.0"),
     ({"max_steps": 0}, "'max_steps'.*-1 or an integer from 1 to 1000000000"),
     ({"agent_speed": [3.0]}, "'agent_speed'"),
+    ({"spawn_delay": 5}, "'spawn_delay'.*a list of 1 to 100 integers from 0 to 1000, not 5"),
+    ({"spawn_delay": [0, 1001]}, "'spawn_delay'"),
+    ({"spawn_delay": []}, "'spawn_delay'"),
 ]
 
 WRONG = {
@@ -161,8 +164,10 @@ def test_wrong_option_changes_nothing(env_id, options, message):
         ("SearingSpotlights-v0", {"num_coins": [21]}),
         ("SearingSpotlights-v0", {"num_coins": 1}),
         ("SearingSpotlights-v0", {"coin_enabled": False}),
+        ("SearingSpotlights-v0", {"coin_feedback": False}),
         ("Endless-SearingSpotlights-v0", {"num_coins": [1]}),
         ("Endless-SearingSpotlights-v0", {"use_exit": False}),
+        ("Endless-SearingSpotlights-v0", {"coin_feedback": 0}),
         ("Endless-SearingSpotlights-v0", {"spawn_interval": 0}),
         ("Endless-SearingSpotlights-v0", {"steps_per_coin": 0}),
     ],

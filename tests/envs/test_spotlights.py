@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 from players import player
 
-from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, RADIUS, REACH, SIGHT, SPEED, TIME
+from memory_gym_envs.entries import vector_slices
+from memory_gym_envs.searing_spotlights import VARIANTS
+from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, RADIUS, REACH, SIGHT, SPEED, START, TIME
 
 FINITE, ENDLESS = "SearingSpotlights-v0", "Endless-SearingSpotlights-v0"
 SAFE = {"spot_damage": 0}
+DARK = {**SAFE, "initial_spawns": 0, "spawn_interval": 10**9, "light_dim_off_duration": 0}  # from the start to the end
+STUCK = {"spot_min_speed": 0.0, "spot_max_speed": 0.0}  # spotlights stay where they start
 
 
 def play_out(env, act, seed, options=None):
@@ -366,3 +370,132 @@ def test_ground_truth_is_where_things_are():
         expected = np.concatenate([bodies[:, AGENT], first, bodies[:, EXIT]]) / 84
         np.testing.assert_allclose(info["ground_truth"], expected)
         _, _, over, _, info = env.step(act())
+
+
+# ---- options that the original lacks ----
+
+
+def coin_and_gain(observation):
+    """Whether a coin is visible, and whether the bar shows a reward."""
+    if observation.ndim == 1:
+        at = vector_slices(VARIANTS[ENDLESS].entries)
+        return bool(observation[at["coin"]][0]), bool(observation[at["rewarded"]][0])
+    orange, yellow = ((observation == color).all(axis=-1) for color in ((255, 165, 0), (255, 255, 0)))
+    return bool(orange[4:].any()), bool(yellow[:4].any())
+
+
+@pytest.mark.parametrize("obs_type", ["pixels", "vector"])
+@pytest.mark.parametrize("feedback", [True, False])
+def test_coin_feedback(feedback, obs_type):
+    """In the dark, the first coin is visible in 6 frames, and each later one in 5 or none; so is its reward."""
+    env, act = make(ENDLESS, obs_type=obs_type)
+    for seed in (3, 4):  # the second episode starts like the first one
+        observation, _ = env.reset(seed=seed, options={**DARK, "coin_feedback": feedback})
+        seen, rewards = [coin_and_gain(observation)], [0.0]
+        for _ in range(150):
+            observation, reward, terminated, _, _ = env.step(act())
+            assert not terminated
+            seen.append(coin_and_gain(observation))
+            rewards.append(reward)
+        taken = np.flatnonzero(rewards)
+        assert len(taken) > 4
+        assert taken[0] > 6
+        coins = {*range(6)} | {step + frame for step in taken for frame in range(5) if feedback}
+        gains = {step + 1 for step in taken if feedback}  # the bar is a step late
+        assert {step for step, (coin, _) in enumerate(seen) if coin} == {step for step in coins if step <= 150}
+        assert {step for step, (_, gain) in enumerate(seen) if gain} == {step for step in gains if step <= 150}
+
+
+@pytest.mark.parametrize("obs_type", ["pixels", "vector"])
+def test_light_shows_a_coin_that_appeared_in_the_dark(obs_type):
+    env, act = make(ENDLESS, obs_type=obs_type)
+    options = {**DARK, **STUCK, "coin_feedback": False, "initial_spawns": 1, "spot_min_radius": 9, "spot_max_radius": 9}
+    env.reset(seed=3, options=options)
+    s, reward = env.batch.state, 0.0
+    while not reward:
+        _, reward, *_ = env.step(act())
+    assert not coin_and_gain(env.step([0, 0])[0])[0]
+    s.spots[START, 0, 0] = s.bodies[:, 0, COIN]
+    assert coin_and_gain(env.step([0, 0])[0])[0]
+
+
+@pytest.mark.parametrize("obs_type", ["pixels", "vector"])
+def test_what_else_shows_coins_and_rewards_is_no_coin_feedback(obs_type):
+    """Coins that are visible in the dark stay so, and the bar shows what else the step paid."""
+    env, act = make(ENDLESS, obs_type=obs_type)
+    options = {**DARK, "coin_feedback": False, "coins_visible": True, "reward_outside_spotlight": 0.5}
+    env.reset(seed=3, options=options)
+    steps = [env.step(act()) for _ in range(100)]
+    assert {reward for _, reward, *_ in steps} == {0.5, 0.75}
+    assert [coin_and_gain(observation) for observation, *_ in steps] == [(True, False)] + [(True, True)] * 99
+
+
+def test_coin_feedback_changes_no_rule():
+    envs, twin = (gym.make_vec(ENDLESS, num_envs=4) for _ in range(2))
+    envs.reset(seed=0, options={**SAFE, "coin_feedback": False})
+    twin.reset(seed=0, options=SAFE)
+    total = 0.0
+    for _ in range(300):
+        ours, theirs = envs.step(player(envs)), twin.step(player(twin))
+        total += ours[1].sum()
+        for left, right in zip(ours[1:4], theirs[1:4], strict=True):
+            np.testing.assert_array_equal(left, right)
+        np.testing.assert_array_equal(ours[4]["ground_truth"], theirs[4]["ground_truth"])
+    assert total > 10
+    assert generators(envs) == generators(twin)
+
+
+def generators(envs):
+    return [rng.bit_generator.state for rng in envs.np_random]
+
+
+def every(env_id, interval):
+    """The options for spotlights that stay, and come with this interval, for ever."""
+    finite = {"initial_spawn_interval": interval - 1, "spawn_interval_threshold": 1, "num_spawns": 10**9}
+    return {**SAFE, **STUCK, "initial_spawns": 0, "max_steps": -1} | (
+        finite if env_id == FINITE else {"spawn_interval": interval, "steps_per_coin": -1}
+    )
+
+
+def spawns(env, steps):
+    """The steps since the reset or the spotlight before, for each that comes in so many steps."""
+    counts = [0] + [(env.step([0, 0]), int(env.batch.state.num_spots[0]))[1] for _ in range(steps)]
+    return np.diff([0, *(np.flatnonzero(np.diff(counts)) + 1)]).tolist()
+
+
+@pytest.mark.parametrize("env_id", [FINITE, ENDLESS])
+def test_spawn_delay(env_id):
+    """It is added to each interval, the first one too."""
+    env, _ = make(env_id)
+    firsts = set()
+    for seed in range(12):
+        env.reset(seed=seed, options={**every(env_id, 5), "spawn_delay": [0, 3, 7]})
+        waits = spawns(env, 300)
+        assert {*waits} == {5, 8, 12}
+        assert sum(waits) > 300 - 12
+        firsts.add(waits[0])
+    assert firsts == {5, 8, 12}
+    env.reset(seed=0, options={**every(env_id, 5), "spawn_delay": [6]})
+    assert spawns(env, 115) == [11] * 10
+    env.reset(seed=0, options=every(env_id, 5))
+    assert spawns(env, 115) == [5] * 23
+
+
+@pytest.mark.parametrize("env_id", [FINITE, ENDLESS])
+def test_one_spawn_delay_takes_no_draw(env_id):
+    """Levels and spotlights are those of the default, and so is the level of several, as it is drawn before."""
+    batches = []
+    for delays in ([0], [4], [4, 4]):
+        env, _ = make(env_id)
+        env.reset(seed=5, options={**every(env_id, 10), "initial_spawns": 2, "spawn_delay": delays})
+        batches.append(env.batch)
+    default, one, several = batches
+    for other in (one, several):
+        np.testing.assert_array_equal(other.state.bodies, default.state.bodies)
+        np.testing.assert_array_equal(other.state.spots, default.state.spots)
+    assert generators(one) == generators(default) != generators(several)
+    for batch, interval in ((default, 10), (one, 14)):
+        for _ in range(3 * interval):
+            batch.step(np.zeros((1, 2), np.int64))
+    np.testing.assert_array_equal(one.state.spots[:, :, :5], default.state.spots[:, :, :5])
+    assert generators(one) == generators(default)

@@ -51,6 +51,7 @@ OPTIONS = {  # played one after the other, each by the ids that have its options
         {"initial_spawns": 0, "num_spawns": 0},
         {"initial_spawns": 0, "num_spawns": 0, "coins_visible": True, "num_coins": [5]},
         {"initial_spawns": 1, "spot_damage": 0.0, "light_dim_off_duration": 0},
+        {"coin_feedback": False, "spot_damage": 0.0},
         {"initial_spawns": 1, "spot_damage": 0.0, "black_background": True, "hide_chessboard": True},
     ],
 }
