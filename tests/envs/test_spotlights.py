@@ -389,7 +389,7 @@ def coin_and_gain(observation):
 def test_coin_feedback(feedback, obs_type):
     """In the dark, the first coin is visible in 6 frames, and each later one in 5 or none; so is its reward."""
     env, act = make(ENDLESS, obs_type=obs_type)
-    for seed in (3, 4):  # the second episode starts like the first one
+    for seed in (4, 5):  # the second episode starts like the first one
         observation, _ = env.reset(seed=seed, options={**DARK, "coin_feedback": feedback})
         seen, rewards = [coin_and_gain(observation)], [0.0]
         for _ in range(150):
