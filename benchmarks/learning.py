@@ -48,22 +48,29 @@ from ppo_utils.runs import parse_args
 ROOT = Path(__file__).parent.parent
 COMMON = "--preset laptop --save-model"
 TEST_LEVELS, FIRST_TEST_LEVEL = 1000, 1_000_000
-TRXL = "ppo_trxl.py --no-trxl-query-position --no-trxl-memory-gradient"  # the thesis', where the preset differs
+# What --preset laptop was until Muon, with which the agents of the two suites have been trained.
+ADAMW = "--optimizer adamw --no-norm-reward --num-envs 32 --num-minibatches 8 --init-lr 1e-3 --final-lr 1e-4"
+ADAMW += " --init-ent-coef 5e-4 --final-ent-coef 5e-5"
+GRU, ADAMW_TRXL = f"ppo_gru.py {ADAMW}", f"ppo_trxl.py {ADAMW} --trxl-dim 64 --trxl-memory-length 128"
+TRXL = f"{ADAMW_TRXL} --no-trxl-query-position --no-trxl-memory-gradient"  # the thesis', where the preset differs
 MEMORIES = {
-    "GRU": "ppo_gru.py --memory gru",
-    "LSTM": "ppo_gru.py --memory lstm",
+    "GRU": f"{GRU} --memory gru",
+    "LSTM": f"{GRU} --memory lstm",
     "TrXL": TRXL,
     "GTrXL": f"{TRXL} --trxl-gate gru",
 }
 # The thesis' exploration bonus, with the weights that suit it on these tasks; the preset has the log barrier.
 ENTROPY = "--exploration-bonus entropy --init-ent-coef 1e-3 --final-ent-coef 1e-4"
 AGENTS = {
-    "no memory": "ppo_gru.py --memory none",
-    "stack of 4": "ppo_gru.py --memory none --frame-stack 4",
-    "stack of 16": "ppo_gru.py --memory none --frame-stack 16",
-    "step encoding": "ppo_gru.py --memory none --step-encoding",
+    "no memory": f"{GRU} --memory none",
+    "stack of 4": f"{GRU} --memory none --frame-stack 4",
+    "stack of 16": f"{GRU} --memory none --frame-stack 16",
+    "step encoding": f"{GRU} --memory none --step-encoding",
     **MEMORIES,
-    "TrXL, preset": "ppo_trxl.py",
+    "TrXL, preset": ADAMW_TRXL,
+    "no memory, Muon": "ppo_gru.py --memory none",  # today's --preset laptop
+    "GRU, Muon": "ppo_gru.py",
+    "TrXL, Muon": "ppo_trxl.py",
     **{f"{name}, entropy": f"{flags} {ENTROPY}" for name, flags in MEMORIES.items()},
     **{f"{name}, refreshed": f"{flags} --refresh-memory" for name, flags in MEMORIES.items()},
     **{f"{name}, gradient": f"{MEMORIES[name]} --trxl-memory-gradient" for name in ("TrXL", "GTrXL")},

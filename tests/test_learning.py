@@ -33,8 +33,9 @@ def test_every_agent_s_command_can_be_parsed(task, agent):
     args = learning.plan(learning.Config(steps_scale=6), learning.TASKS[task], agent, 2).args
     assert args.total_timesteps == args.anneal_steps == 6 * learning.TASKS[task].total_timesteps
     assert args.refresh_memory == ("refreshed" in agent)
-    assert getattr(args, "trxl_memory_gradient", False) == ("gradient" in agent or "preset" in agent)
-    assert getattr(args, "trxl_query_position", False) == ("preset" in agent)  # the thesis' queries do not know it
+    of_a_preset = agent in ("TrXL, preset", "TrXL, Muon")  # the thesis' queries do not know their step
+    assert getattr(args, "trxl_query_position", False) == of_a_preset
+    assert getattr(args, "trxl_memory_gradient", False) == ("gradient" in agent or of_a_preset)
     assert getattr(args, "trxl_gate", None) == {"TrXL": "none", "GTrXL": "gru"}.get(agent.split(",")[0])
 
 
