@@ -126,6 +126,19 @@ def iqm(scores: np.ndarray) -> np.ndarray:
     return trim_mean(scores.reshape(*scores.shape[:-3], -1), 0.25, axis=-1)
 
 
+def standard_error(scores: np.ndarray) -> float:
+    """Return the standard error of the mean of scores (R, M, E), for other seeds and other levels.
+
+    All seeds play the same levels, so the variance of the mean has two parts: that of the seeds' means over R, and that
+    of the levels' means over M, each estimated without bias. A bootstrap over seeds and levels estimates the same, but
+    with three seeds has two thirds of the first part. With one seed, NaN.
+    """
+    seeds, levels = scores.mean((1, 2)), scores.mean((0, 2))
+    if len(seeds) < 2:
+        return math.nan
+    return math.sqrt(seeds.var(ddof=1) / len(seeds) + levels.var(ddof=1) / len(levels))
+
+
 def interval(scores: np.ndarray) -> np.ndarray | None:
     """Return the ends (2, ...) of the IQM's 95 % bootstrap interval for scores (..., R, M, E); None for a single seed.
 

@@ -107,6 +107,11 @@ class Task:
         return 0.1 * self.options.get("command_count", [10])[0] if self.env_id.startswith("MortarMayhem") else None
 
     @property
+    def best_score(self) -> float | None:
+        """Return the best score that is possible, None where there is no bound."""
+        return 1.0 if self.score in ("carried_out", "success") else None
+
+    @property
     def score(self) -> str:
         """Return the name of the score by which agents are compared: the metric, or what they carried out.
 
@@ -460,50 +465,59 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
 
 
 def row(agent: str, runs: list[evaluate.RunLog], task: Task, best: float) -> str:
-    """Return the agent's row: its last score, the largest drop, and what nine tenths of the best agent's IQM took.
+    """Return the agent's row: its score, that of each seed, the largest drop, and the minutes to 0.5 and 0.9 of `best`.
 
-    A drop is how far a seed's mean is below an earlier one. If the task's score is not its metric, the mean of the
-    metric stands beside that of the score.
+    Drops and minutes are those of the curve on development levels. A drop is how far a seed's mean is below an earlier
+    one. If the task's score is not its metric, the mean of the metric stands behind the score.
     """
-    steps, scores = evaluate.align([run.curves[f"eval/{task.score}"] for run in runs])  # (P,), (P, R, M, E)
+    scores = final_scores(task.score, runs)  # (R, M, E)
+    steps, curve = evaluate.align([run.curves[f"eval/{task.score}"] for run in runs])  # (P,), (P, R, M, E)
     minutes = 60 * np.mean([run.hours(steps) for run in runs], 0)  # (P,), without evaluations
-    ends = evaluate.interval(scores[-1])
-    means = scores.mean((-2, -1))  # (P, R)
+    means = curve.mean((-2, -1))  # (P, R)
     drop = (np.maximum.accumulate(means) - means).max()
-    middle = evaluate.iqm(scores)  # (P,)
-    near = np.flatnonzero(middle >= 0.9 * best)
-    taken = (f"{steps[near[0]]:,.0f}", f"{minutes[near[0]]:.1f}") if near.size else ("never", "")
-    if best == 0:
-        taken = ("the best is 0", "")
-    span = "one seed" if ends is None else "{:.2f} to {:.2f}".format(*ends)
-    each_seed = ", ".join(f"{mean:.2f}" for mean in means[-1])
-    mean = f"{scores[-1].mean():.2f}"
+    cells = [agent, mean_and_error(scores), f"{evaluate.iqm(scores):.2f}"]
+    cells.append(", ".join(f"{mean:.2f}" for mean in scores.mean((1, 2))))
     if task.score != task.metric:
-        mean += f" | {last_scores(task.metric, runs).mean():.2f}"
-    reached = f"{each_seed} | {mean} | {middle[-1]:.2f} | {span} | {drop:.2f}"
-    return f"| {agent} | {reached} | {' | '.join(taken)} | {minutes[-1]:.1f} |"
+        cells.append(f"{final_scores(task.metric, runs).mean():.2f}")
+    cells.append(f"{drop:.2f}")
+    for share in (0.5, 0.9):
+        there = np.flatnonzero(means.mean(1) >= share * best)
+        cells.append(f"{minutes[there[0]]:.1f}" if there.size and best else "")
+    return f"| {' | '.join(cells)} | {minutes[-1]:.1f} |"
 
 
-def last_scores(name: str, runs: list[evaluate.RunLog]) -> np.ndarray:
-    """Return the scores (R, M, E) of an agent's seeds at the end of training, by the name of a metric or score."""
-    return evaluate.align([run.curves[f"eval/{name}"] for run in runs])[1][-1]
+def mean_and_error(scores: np.ndarray) -> str:
+    """Return the mean of scores (R, M, E) with its standard error, if there are several seeds."""
+    error = evaluate.standard_error(scores)
+    return f"{scores.mean():.2f}" + ("" if math.isnan(error) else f" ± {error:.2f}")
+
+
+def final_scores(name: str, runs: list[evaluate.RunLog]) -> np.ndarray:
+    """Return the scores (R, M, E) of the seeds' final weights, by the name of a metric or score.
+
+    They are those on the test levels, or where a run has none, on the development levels.
+    """
+    levels = "test" if all(f"test/{name}" in run.curves for run in runs) else "eval"
+    return evaluate.align([run.curves[f"{levels}/{name}"] for run in runs])[1][-1]
 
 
 def table(task: Task, agents: evaluate.Runs) -> str:
-    """Return a task's table, a row for each agent that has runs, and below it what these took and on which machines."""
+    """Return a task's table, a row for each agent that has runs, and below it what these took and on which machines.
+
+    The best is the best possible score, or where there is no bound the highest mean of these agents.
+    """
     runs_of = {agent: runs for agent, runs in agents.items() if runs}
-    best = max(float(evaluate.iqm(last_scores(task.score, runs))) for runs in runs_of.values())
+    best = task.best_score or max(float(final_scores(task.score, runs).mean()) for runs in runs_of.values())
     every_run = [run for runs in runs_of.values() for run in runs]
     hours = sum(run.seconds("iteration").sum() for run in every_run) / 3600
     machines = "; ".join(dict.fromkeys(run.machine for run in every_run))
     metric = () if task.score == task.metric else (task.metric,)
-    taken = ("largest drop", "steps to 0.9 of the best", "minutes to there", "minutes")
-    header = ("agent", "each seed", "mean", *metric, "IQM", "95 % interval", *taken)
-    left = ("agent", "each seed", "95 % interval")
+    taken = ("largest drop", "minutes to 0.5 of the best", "minutes to 0.9", "minutes")
+    header = ("agent", "mean", "IQM", "each seed", *metric, *taken)
     lines = [
         f"{task.score} after {int(every_run[0].args['total_timesteps']):,} steps\n",
         f"| {' | '.join(header)} |",
-        f"|{'|'.join('---' if name in left else '---:' for name in header)}|",
+        f"|{'|'.join('---' if name in ('agent', 'each seed') else '---:' for name in header)}|",
         *(row(agent, runs, task, best) for agent, runs in runs_of.items()),
         f"\nRuns: {len(every_run)}, together {hours:.1f} hours without evaluations. Machines: {machines}",
     ]
@@ -511,7 +525,7 @@ def table(task: Task, agents: evaluate.Runs) -> str:
 
 
 def overview(tasks: dict[str, evaluate.Runs]) -> str:
-    """Return a table with a row for each task: the IQM of each agent at the end of training, and its mean in brackets.
+    """Return a table with a row for each task: the mean score of each agent's final weights, and its standard error.
 
     Where an agent has fewer seeds than others, it says how many; where it has none, there is no number.
     """
@@ -521,9 +535,8 @@ def overview(tasks: dict[str, evaluate.Runs]) -> str:
     def cell(task: Task, runs: list[evaluate.RunLog]) -> str:
         if not runs:
             return ""
-        scores = last_scores(task.score, runs)
         few = f", {len(runs)} seed{'s' * (len(runs) > 1)}" if len(runs) < most else ""
-        return f"{evaluate.iqm(scores):.2f} ({scores.mean():.2f}){few}"
+        return mean_and_error(final_scores(task.score, runs)) + few
 
     lines = [f"| task, score | {' | '.join(names)} |", f"|---|{'---:|' * len(names)}"]
     for task, agents in tasks.items():

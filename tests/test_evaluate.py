@@ -67,6 +67,22 @@ def test_interval_is_that_of_all_resamples(scores):
     assert evaluate.interval(np.array(scores, float)[..., None]) == pytest.approx([low, high])
 
 
+def test_standard_error_by_hand():
+    """Seeds' means 2 and 4 have a variance of 2, levels' means 1, 3 and 5 one of 4."""
+    scores = np.array([[0.0, 2.0, 4.0], [2.0, 4.0, 6.0]])[..., None].repeat(5, axis=-1)  # (2, 3, 5)
+    assert evaluate.standard_error(scores) == pytest.approx(np.sqrt(2 / 2 + 4 / 3))
+    assert np.isnan(evaluate.standard_error(scores[:1]))
+
+
+def test_standard_error_is_that_of_repeated_experiments():
+    """The deviation of the mean over experiments, each with its own seeds and levels, which add up here."""
+    rng = np.random.default_rng(0)
+    seeds, levels = rng.normal(0, 2, (4000, 3, 1, 1)), rng.normal(0, 5, (4000, 1, 50, 1))
+    experiments = seeds + levels
+    errors = [evaluate.standard_error(each) ** 2 for each in experiments]
+    assert np.mean(errors) == pytest.approx(experiments.mean((1, 2, 3)).var(), rel=0.05)
+
+
 def test_interval_for_every_point_of_a_curve():
     scores = np.random.default_rng(1).normal(size=(3, 5, 4, 2))
     each = np.stack([evaluate.interval(point) for point in scores], axis=-1)

@@ -109,9 +109,8 @@ def test_an_agent_goes_on_with_no_other_run(tmp_path):
 
 
 def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, capsys):
-    agent, task = "GRU, refreshed", learning.TASKS["mortar-mayhem"]
     small = "--num-envs 4 --num-steps 32 --num-minibatches 2 --hidden-size 8 --eval-levels 2"
-    monkeypatch.setattr(learning, "COMMON", f"{learning.COMMON} {small}")
+    agent, task = f"GRU, refreshed {small}", learning.TASKS["mortar-mayhem"]
     monkeypatch.setattr(learning, "TEST_LEVELS", 5)
     config = learning.Config(
         tasks=("mortar-mayhem",),
@@ -163,8 +162,8 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     learning.main(config)  # its result is enough
     told = capsys.readouterr().out
     assert "trained" not in told
-    score = carried_out[-1].mean()
-    assert f"\n| {agent} | {score:.2f} | {score:.2f} |" in told
+    score = tested.mean()
+    assert f"\n| {agent} | {score:.2f} | {evaluate.iqm(tested):.2f} | {score:.2f} |" in told
     assert f"\nRuns: 1, together 0.0 hours without evaluations. Machines: {kept.machine}\n" in told
     assert config.out.with_suffix(".png").stat().st_size > 10_000
 
@@ -272,10 +271,22 @@ def test_a_log_tells_how_far_its_training_is(tmp_path):
 def test_a_row_of_the_table():
     task, fallen = learning.TASKS["Endless-SearingSpotlights-v0"], run_with(7, 3, 8)  # it fell from 7 to 3
     row = learning.row("GRU", [run_with(2, 9, 10), fallen], task, best=6.0)
-    assert row == "| GRU | 10.00, 8.00 | 9.00 | 9.00 | 8.00 to 10.00 | 4.00 | 200 | 2.0 | 3.0 |"
-    assert " | never |  | 3.0 |" in learning.row("GRU", [run_with(2, 9, 10), fallen], task, best=12.0)
-    assert "| 8.00 | 8.00 | one seed |" in learning.row("GRU", [fallen], task, best=12.0)
-    assert "| the best is 0 |  | 3.0 |" in learning.row("GRU", [run_with(0, 0, 0)], task, best=0.0)
+    # The seeds' means, 10 and 8, have a standard error of 1; all levels are equal.
+    assert row == "| GRU | 9.00 ± 1.00 | 9.00 | 10.00, 8.00 | 4.00 | 1.0 | 2.0 | 3.0 |"
+    assert " | 4.00 | 2.0 |  | 3.0 |" in learning.row("GRU", [run_with(2, 9, 10), fallen], task, best=12.0)
+    assert "| 8.00 | 8.00 | 8.00 |" in learning.row("GRU", [fallen], task, best=12.0)
+    assert "| 0.00 |  |  | 3.0 |" in learning.row("GRU", [run_with(0, 0, 0)], task, best=0.0)
+
+
+def test_scores_are_those_on_test_levels_where_all_runs_have_them():
+    task, runs = learning.TASKS["Endless-SearingSpotlights-v0"], [run_with(1, 2, 3), run_with(1, 2, 5)]
+    assert learning.final_scores(task.score, runs).mean() == 4
+    runs[0].curves["test/coins_collected"] = [300], np.full((1, 7, 1), 2.0)
+    assert learning.final_scores(task.score, runs).mean() == 4
+    runs[1].curves["test/coins_collected"] = [300], np.full((1, 7, 1), 1.0)
+    assert learning.final_scores(task.score, runs).shape == (2, 7, 1)
+    row = learning.row("GRU", runs, task, best=4.0)
+    assert row == "| GRU | 1.50 ± 0.50 | 1.50 | 2.00, 1.00 | 0.00 | 2.0 | 3.0 | 3.0 |"
 
 
 def test_agents_of_finite_mortar_mayhem_are_compared_by_what_they_carried_out():
@@ -285,21 +296,21 @@ def test_agents_of_finite_mortar_mayhem_are_compared_by_what_they_carried_out():
     for run, shares in ((slow, (0.25, 0.25, 0.75)), (fast, (0.25, 1, 1))):
         run.curves["eval/carried_out"] = run_with(*shares).curves["eval/coins_collected"]
     table = learning.table(task, {"slow": [slow], "fast": [fast]}).splitlines()
-    assert "| slow | 0.75 | 0.75 | 1.00 | 0.75 | one seed | 0.00 | never |  | 3.0 |" in table
-    assert "| fast | 1.00 | 1.00 | 1.00 | 1.00 | one seed | 0.00 | 200 | 2.0 | 3.0 |" in table
+    assert "| slow | 0.75 | 0.75 | 0.75 | 1.00 | 0.00 | 3.0 |  | 3.0 |" in table
+    assert "| fast | 1.00 | 1.00 | 1.00 | 1.00 | 0.00 | 2.0 | 2.0 | 3.0 |" in table
 
 
 def test_a_table_leaves_out_agents_without_runs_and_compares_with_the_best():
-    metric = learning.TASKS["SearingSpotlights-v0"].metric
-    ours, theirs = (run_with(0, 0.5, last, metric=f"eval/{metric}") for last in (0.5, 1))
-    table = learning.table(
-        learning.TASKS["SearingSpotlights-v0"], {"GRU": [ours], "LSTM": [], "TrXL": [theirs, theirs]}
-    )
-    head, *rows, note = [line for line in table.splitlines() if line]
-    assert head == "success after 300 steps"
-    assert [row.split(" | ")[0] for row in rows[2:]] == ["| GRU", "| TrXL"]
-    assert ["never" in row for row in rows[2:]] == [True, False]
-    assert note == "Runs: 3, together 0.1 hours without evaluations. Machines: a laptop"
+    """Of success the best is 1, whoever reaches it; of coins it is the best agent's score."""
+    for name, minutes in (("SearingSpotlights-v0", " | 2.0 |  | 3.0 |"), ("Endless-SearingSpotlights-v0", "| 2.0 | 2.0 |")):
+        task = learning.TASKS[name]
+        ours, theirs = (run_with(0, 0.5, last, metric=f"eval/{task.metric}") for last in (0.5, 0.4))
+        table = learning.table(task, {"GRU": [ours], "LSTM": [], "TrXL": [theirs, theirs]})
+        head, *rows, note = [line for line in table.splitlines() if line]
+        assert head == f"{task.metric} after 300 steps"
+        assert [row.split(" | ")[0] for row in rows[2:]] == ["| GRU", "| TrXL"]
+        assert minutes in rows[2]
+        assert note == "Runs: 3, together 0.1 hours without evaluations. Machines: a laptop"
 
 
 def test_an_overview_says_where_seeds_or_agents_are_missing():
@@ -312,8 +323,8 @@ def test_an_overview_says_where_seeds_or_agents_are_missing():
     assert learning.overview(tasks).splitlines() == [
         "| task, score | GRU | LSTM |",
         "|---|---:|---:|",
-        "| SearingSpotlights-v0, success | 0.25 (0.25) | 0.25 (0.25), 1 seed |",
-        "| Endless-MortarMayhem-v0, commands_completed | 2.00 (2.00), 2 seeds |  |",
+        "| SearingSpotlights-v0, success | 0.25 ± 0.00 | 0.25, 1 seed |",
+        "| Endless-MortarMayhem-v0, commands_completed | 2.00 ± 0.00, 2 seeds |  |",
     ]
 
 
