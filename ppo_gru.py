@@ -189,8 +189,12 @@ LAPTOP = {
     "obs_type": "vector",
     "hidden_size": 128,
     "trunk_size": 128,
+    "num_envs": 128,
     "num_steps": 128,
-    "update_epochs": 4,
+    "optimizer": "muon",
+    "update_epochs": 2,
+    "num_minibatches": 16,
+    "norm_reward": True,
     "gamma": 0.99,
     "clip_coef": 0.2,
     "max_grad_norm": 0.5,
@@ -198,10 +202,10 @@ LAPTOP = {
     "init_lr": 1e-3,
     "final_lr": 1e-4,
     "exploration_bonus": "log-barrier",
-    "init_ent_coef": 5e-4,
-    "final_ent_coef": 5e-5,
-    "anneal_steps": 1_000_000,
-    "total_timesteps": 1_000_000,
+    "init_ent_coef": 2e-3,
+    "final_ent_coef": 2e-4,
+    "anneal_steps": 4_000_000,
+    "total_timesteps": 4_000_000,
 }
 QUICKSTART = {
     **LAPTOP,
@@ -209,8 +213,10 @@ QUICKSTART = {
     # Two commands, each shown for one step, and six steps to carry one out.
     "env_options": '{"command_count": [2], "command_show_duration": [1], "command_show_delay": [0], '
     '"explosion_delay": [4], "explosion_duration": [2]}',
-    "anneal_steps": 500_000,
-    "total_timesteps": 500_000,
+    "num_steps": 32,
+    "num_minibatches": 8,
+    "anneal_steps": 400_000,
+    "total_timesteps": 400_000,
 }
 PRESETS = {"thesis": {}, "laptop": LAPTOP, "quickstart": QUICKSTART}  # thesis: the defaults above
 

@@ -49,8 +49,8 @@ ROOT = Path(__file__).parent.parent
 COMMON = "--preset laptop --save-model"
 TEST_LEVELS, FIRST_TEST_LEVEL = 1000, 1_000_000
 # What --preset laptop was until Muon, with which the agents of the two suites have been trained.
-ADAMW = "--optimizer adamw --no-norm-reward --num-envs 32 --num-minibatches 8 --init-lr 1e-3 --final-lr 1e-4"
-ADAMW += " --init-ent-coef 5e-4 --final-ent-coef 5e-5"
+ADAMW = "--optimizer adamw --no-norm-reward --num-envs 32 --update-epochs 4 --num-minibatches 8"
+ADAMW += " --init-lr 1e-3 --final-lr 1e-4 --init-ent-coef 5e-4 --final-ent-coef 5e-5"
 GRU, ADAMW_TRXL = f"ppo_gru.py {ADAMW}", f"ppo_trxl.py {ADAMW} --trxl-dim 64 --trxl-memory-length 128"
 TRXL = f"{ADAMW_TRXL} --no-trxl-query-position --no-trxl-memory-gradient"  # the thesis', where the preset differs
 MEMORIES = {

@@ -42,7 +42,8 @@ def test_every_claim_compares_agents_that_can_be_trained(name):
 
 def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     small = "--num-envs 2 --num-steps 32 --num-minibatches 2 --trunk-size 8 --eval-levels 2"
-    monkeypatch.setattr(learning, "COMMON", f"{learning.COMMON} {small}")
+    agents = {name: f"{flags} {small}" for name, flags in learning.AGENTS.items()}
+    monkeypatch.setattr(learning, "AGENTS", agents)
     config = claims.Config(
         claims=("normalized-gradients",), steps_scale=64 / 1e6, seeds=(1, 2), evaluations=1, folder=tmp_path / "runs"
     )
