@@ -1,0 +1,69 @@
+"""What random actions, and a scripted player that sees the whole state, score on the test levels of learning.py.
+
+    python benchmarks/bounds.py
+
+An agent's score stands between them. The player, of tests/envs/players.py, knows the target and walks to it. In Searing
+Spotlights it goes straight through the light. In the endless tasks it stops after MAX_STEPS steps, or where the path of
+Endless Mystery Path goes left, where nobody can follow it. Prints a row for each of the ten tasks, with the standard
+error over levels.
+"""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import tyro
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/envs"))
+
+from players import choices, player
+
+from learning import FIRST_TEST_LEVEL, FULL, TEST_LEVELS, Task
+
+MAX_STEPS = 10_000  # as in evaluate.py
+
+
+def random_player(envs: gym.vector.VectorEnv, rng: np.random.Generator) -> np.ndarray:
+    """Return random actions."""
+    return rng.integers(0, choices(envs), envs.action_space.shape)
+
+
+def scripted_player(envs: gym.vector.VectorEnv, rng: np.random.Generator) -> np.ndarray:
+    """Return the actions of the player that sees the whole state."""
+    return player(envs)
+
+
+def play(task: Task, actions_of: Callable, levels: int = TEST_LEVELS, max_steps: int = MAX_STEPS) -> np.ndarray:
+    """Return a player's score on each test level, (M,)."""
+    envs = gym.make_vec(task.env_id, num_envs=levels, obs_type="vector", max_episode_steps=max_steps)
+    envs.reset(seed=FIRST_TEST_LEVEL, options=task.options)
+    rng, scores, playing = np.random.default_rng(0), np.zeros(levels), np.ones(levels, bool)
+    name = "reward" if task.best_return or task.metric == "return" else task.metric
+    while playing.any():
+        *_, infos = envs.step(actions_of(envs, rng))
+        if "final_info" in infos:
+            ended = infos["_final_info"] & playing
+            scores[ended] = infos["final_info"][name][ended] / (task.best_return or 1.0)
+            playing &= ~ended
+    return scores
+
+
+def main(levels: int = TEST_LEVELS, max_steps: int = MAX_STEPS) -> None:
+    """Print the table.
+
+    Args:
+        levels: how many test levels to play.
+        max_steps: steps after which an endless episode is cut short.
+    """
+    print("| task, score | random actions | scripted player |\n|---|---:|---:|")
+    for name, task in FULL.items():
+        scores = [play(task, each, levels, max_steps) for each in (random_player, scripted_player)]
+        cells = [f"{each.mean():.2f} ± {each.std(ddof=1) / np.sqrt(levels):.2f}" for each in scores]
+        print(f"| {name}, {task.score} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
