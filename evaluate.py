@@ -131,12 +131,13 @@ def standard_error(scores: np.ndarray) -> float:
 
     All seeds play the same levels, so the variance of the mean has two parts: that of the seeds' means over R, and that
     of the levels' means over M, each estimated without bias. A bootstrap over seeds and levels estimates the same, but
-    with three seeds has two thirds of the first part. With one seed, NaN.
+    with three seeds has two thirds of the first part. With one seed, NaN; of a single level, the first part alone.
     """
     seeds, levels = scores.mean((1, 2)), scores.mean((0, 2))
     if len(seeds) < 2:
         return math.nan
-    return math.sqrt(seeds.var(ddof=1) / len(seeds) + levels.var(ddof=1) / len(levels))
+    of_levels = levels.var(ddof=1) / len(levels) if len(levels) > 1 else 0.0
+    return math.sqrt(seeds.var(ddof=1) / len(seeds) + of_levels)
 
 
 def interval(scores: np.ndarray) -> np.ndarray | None:

@@ -8,23 +8,32 @@ training takes minutes, up to an hour in the longer ones, as in benchmarks/learn
 these are; so a verdict is about these tasks. In the small Mystery Path, transformers have no positional encoding, as
 there.
 
-A claim compares pairs of agents. It holds if, in all pairs, each seed of one agent is better than each of the other; it
-does not hold if, in some pair, each is worse; otherwise, and with fewer than three seeds, it is not decided. Where the
-thesis says that agents are no better than others, that is contradicted if one is, with each of its seeds. With three
-seeds each, chance alone separates two equal agents in each direction in one of twenty pairs. A claim of several pairs
-is harder to confirm and easier to refute: of two agents against four, all equal, chance alone hardly ever makes it
-hold, and makes it not hold in a quarter of the cases. With --report nothing is trained, and a claim is not tested if
-runs are missing.
+A claim compares pairs of agents: each that is said to have the higher number with each that is said to have the lower
+one. A pair is decided if the means differ by at least two standard errors of their difference, over seeds and levels.
+The claim holds if all of its pairs are decided its way, does not hold if one is decided the other way, and else is not
+decided. Where the thesis says that agents are no better than others, that is contradicted if a pair is decided. Where
+no agent of a row scores higher than those without memory, the task has not been learned, and there is no verdict.
+
+With so many rows, some verdicts come by chance. A star marks those that also stand at a family-wise error of 5 % (Holm,
+1979), by Student's t-distribution with as many degrees of freedom as the pair's seeds leave, four with three each. A
+row of several pairs has the largest of their p-values where all of them are needed, else the smallest times their
+number.
+
+With --report nothing is trained, and a claim is not tested if runs are missing.
 """
 
 import itertools
+import math
+import re
 import signal
 import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import scipy.stats
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
@@ -50,6 +59,7 @@ GOAL_IN_VIEW = replace(MYSTERY_PATH, options=MYSTERY_PATH.options | {"show_origi
 ALL_IN_VIEW = Task(
     "SearingSpotlights-v0", 1_000_000, dict.fromkeys(("agent_visible", "coins_visible", "exit_visible"), True)
 )
+DECIDED = 2.0  # standard errors of a difference
 FEW_FRAMES = ("no memory", "stack of 4", "step encoding")
 # With about as many parameters as the GRU: the thesis' transformer and GTrXL, and one whose queries know their step.
 WIDE_TRXL, WIDE_GTRXL = f"TrXL {learning.WIDE}", f"GTrXL {learning.WIDE}"
@@ -61,24 +71,25 @@ TO_1E_4, TO_1E_5 = "TrXL --anneal-steps 200000", "TrXL --anneal-steps 200000 --f
 NOT_NORMALIZED, NORMALIZED = "GRU --target-kl None", "GRU --target-kl None --norm-adv minibatch"
 
 
-def score(task: Task, run: evaluate.RunLog) -> float:
-    """Return the mean of a run's last evaluation."""
-    return run.curves[f"eval/{task.score}"][1][-1].mean()
+# What is compared, (R, M): of each seed, on each level.
+def score(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
+    """Return the scores of the final weights."""
+    return learning.final_scores(task.score, runs).mean(-1)
 
 
-def area(task: Task, run: evaluate.RunLog) -> float:
-    """Return the mean of a run's learning curve: it is higher where fewer samples are needed."""
-    return run.curves[f"eval/{task.score}"][1].mean()
+def area(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
+    """Return the means of the learning curves: they are higher where fewer samples are needed."""
+    return evaluate.align([run.curves[f"eval/{task.score}"] for run in runs])[1].mean((0, -1))
 
 
-def falls(task: Task, run: evaluate.RunLog) -> float:
-    """Return the mean number of falls in the episodes of a run's last evaluation."""
-    return run.curves["eval/num_fails"][1][-1].mean()
+def falls(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
+    """Return how often the final weights fall off."""
+    return learning.final_scores("num_fails", runs).mean(-1)
 
 
-def gradient_norm(task: Task, run: evaluate.RunLog) -> float:
-    """Return the mean norm of a run's gradients before they are clipped."""
-    return run.curves["losses/grad_norm"][1].mean()
+def gradient_norm(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
+    """Return the mean norms of the gradients before they are clipped, (R, 1)."""
+    return np.array([[run.curves["losses/grad_norm"][1].mean()] for run in runs])
 
 
 @dataclass(frozen=True)
@@ -93,7 +104,7 @@ class Claim:
     task: Task
     higher: tuple[str, ...]
     lower: tuple[str, ...]
-    measure: Callable[[Task, evaluate.RunLog], float] = score
+    measure: Callable[[Task, list[evaluate.RunLog]], np.ndarray] = score
     expects_difference: bool = True
 
 
@@ -302,30 +313,84 @@ class Config(learning.Training):
     """of those that this program knows"""
 
 
-def verdict(claim: Claim, higher: np.ndarray, lower: np.ndarray) -> str:
-    """Return the verdict on a claim, from a number a run: (agents, R) each, R seeds."""
-    if np.shape(higher)[-1] < 3:
-        return "not decided"
-    separated = [high.min() > low.max() for high, low in itertools.product(higher, lower)]
-    reversed_ = [high.max() < low.min() for high, low in itertools.product(higher, lower)]
+@dataclass(frozen=True)
+class Comparison:
+    """Two agents' numbers: by how many standard errors the first one's mean is higher, and how surely it is another."""
+
+    errors: float
+    p_value: float  # two-sided
+
+    @classmethod
+    def of(cls, higher: np.ndarray, lower: np.ndarray) -> "Comparison":
+        """Compare numbers (R, M) of the seeds of two agents, which played the same M levels.
+
+        The variance of the difference has a part of each agent's seeds, and one of the levels' differences.
+        """
+        seeds = sum(each.mean(1).var(ddof=1) / len(each) for each in (higher, lower))
+        levels = higher.mean(0) - lower.mean(0)  # (M,)
+        if len(levels) > 1:
+            seeds += levels.var(ddof=1) / len(levels)
+        difference = levels.mean()
+        errors = difference / math.sqrt(seeds) if seeds else math.copysign(math.inf, difference) if difference else 0.0
+        return cls(errors, 2 * scipy.stats.t.sf(abs(errors), len(higher) + len(lower) - 2))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A verdict on a claim, and the p-value of what it says; 1 where it says nothing."""
+
+    text: str
+    p_value: float = 1.0
+
+
+def verdict(claim: Claim, pairs: list[Comparison]) -> Verdict:
+    """Return the verdict on a claim, from the comparisons of its pairs."""
+    above = [pair.p_value for pair in pairs if pair.errors >= DECIDED]
+    below = [pair.p_value for pair in pairs if pair.errors <= -DECIDED]
     if not claim.expects_difference:
-        return "contradicted" if any(separated) else "not contradicted"
-    return "holds" if all(separated) else "does not hold" if any(reversed_) else "not decided"
+        return Verdict("contradicted", min(1, len(pairs) * min(above))) if above else Verdict("not contradicted")
+    if below:
+        return Verdict("does not hold", min(1, len(pairs) * min(below)))
+    return Verdict("holds", max(above)) if len(above) == len(pairs) else Verdict("not decided")
 
 
-def row(name: str, plans: list[learning.Plan], results: list[evaluate.RunLog | None]) -> str:
-    """Return a claim's row of the table, from the results of what was planned for it, None where one is missing."""
-    claim, numbers = CLAIMS[name], {}
-    if None in results:
-        missing = f"not tested: {results.count(None)} of {len(results)} runs are missing"
-        return f"| {claim.section} | {claim.text} | `{name}` | | {missing} |"
-    for agent in (*claim.higher, *claim.lower):
-        runs = [run for run, plan in zip(results, plans, strict=True) if plan.agent == agent]
-        numbers[agent] = np.array([claim.measure(claim.task, run) for run in runs])  # (R,)
-    figures = "; ".join(f"{agent} {x.mean():.3g} ({x.min():.3g} to {x.max():.3g})" for agent, x in numbers.items())
-    found = verdict(claim, *([numbers[agent] for agent in agents] for agents in (claim.higher, claim.lower)))
+def is_learned(claim: Claim, runs: dict[str, list[evaluate.RunLog]], without: list[evaluate.RunLog]) -> bool:
+    """Return whether any agent of the claim scores higher than one without memory, if there are runs of that.
+
+    An agent without memory that is one of the claim's has to be passed by another.
+    """
+    if not without:
+        return True
+    base = score(claim.task, without)
+    scores = [score(claim.task, members) for agent, members in runs.items() if not agent.startswith("no memory")]
+    return any(Comparison.of(each, base).errors >= DECIDED for each in scores)
+
+
+def holm(p_values: list[float], level: float = 0.05) -> list[bool]:
+    """Return which of these p-values stand at this family-wise error (Holm, 1979)."""
+    order = np.argsort(p_values)
+    limits = level / np.arange(len(order), 0, -1)
+    passed = np.cumprod(np.array(p_values)[order] <= limits).astype(bool)  # from the smallest to the first that fails
+    return passed[np.argsort(order)].tolist()
+
+
+def short(agent: str) -> str:
+    """Return an agent's name for the table: its flags in words, without those that make a transformer wide."""
+    name = agent.replace(f" {learning.WIDE}", "")
+    return re.sub(r" --(?:trxl-)?([\w-]+)", lambda found: f", {found[1].replace('-', ' ')}", name)
+
+
+def row(name: str, runs: dict[str, list[evaluate.RunLog]], found: str) -> str:
+    """Return a claim's row of the table, from the seeds of its agents: their means and standard errors."""
+    claim = CLAIMS[name]
+
+    def cell(agents: tuple[str, ...]) -> str:
+        numbers = {short(agent): claim.measure(claim.task, runs[agent])[..., None] for agent in agents}
+        return ", ".join(f"{agent} {learning.mean_and_error(each)}" for agent, each in numbers.items())
+
     measure = claim.measure.__name__.replace("_", " ")
-    return f"| {claim.section} | {claim.text} | `{name}` | {measure}: {figures} | {found} |"
+    text = f"{claim.text} ({claim.section}; `{name}`)"
+    return f"| {text} | {measure} | {cell(claim.higher)} | {cell(claim.lower)} | {found} |"
 
 
 def main(config: Config) -> None:
@@ -345,9 +410,30 @@ def main(config: Config) -> None:
     if not config.report:
         learning.train_missing(config, [*each_once.values()])
     results = {command: learning.result_of(config, plan) for command, plan in each_once.items()}
-    print("| section | claim | name | mean of the seeds (lowest to highest) | verdict |\n|---|---|---|---|---|")
+    runs, verdicts = {}, {}
     for name in config.claims:
-        print(row(name, plans[name], [results[plan.command] for plan in plans[name]]))
+        claim = CLAIMS[name]
+        found = {agent: [] for agent in (*claim.higher, *claim.lower)}
+        for each in plans[name]:
+            found[each.agent] += [run for run in [results[each.command]] if run is not None]
+        missing = sum(len(config.seeds) - len(members) for members in found.values())
+        if missing:
+            print(f"`{name}` is not tested: {missing} of {len(plans[name])} runs are missing")
+            continue
+        without = [learning.result_of(config, learning.plan(config, claim.task, "no memory", i)) for i in config.seeds]
+        runs[name] = found
+        pairs = itertools.product(claim.higher, claim.lower)
+        measured = {agent: claim.measure(claim.task, members) for agent, members in found.items()}
+        verdicts[name] = verdict(claim, [Comparison.of(measured[one], measured[other]) for one, other in pairs])
+        if None not in without and not is_learned(claim, found, without):
+            verdicts[name] = Verdict("not learned")
+    stars = dict(zip(verdicts, holm([each.p_value for each in verdicts.values()]), strict=True))
+    print("| claim | measure | expected higher | expected lower | verdict |\n|---|---|---|---|---|")
+    for name, found in verdicts.items():
+        print(row(name, runs[name], found.text + " \\*" * stars[name]))
+    counts = Counter(found.text for found in verdicts.values())
+    summary = ", ".join(f"{count} {text}" for text, count in counts.most_common())
+    print(f"\nOf {len(verdicts)} rows: {summary}. With a star: {sum(stars.values())}.")
 
 
 if __name__ == "__main__":

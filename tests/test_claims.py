@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 
 import claims
 import learning
@@ -12,25 +13,76 @@ import learning
 ROOT = Path(__file__).parents[1]
 
 
+def pair(errors, p_value=0.01):
+    return claims.Comparison(errors, p_value)
+
+
 @pytest.mark.parametrize(
-    ("higher", "lower", "expects_difference", "verdict"),
+    ("pairs", "expects_difference", "text", "p_value"),
     [
-        ([[4, 5, 6]], [[1, 2, 3]], True, "holds"),
-        ([[1, 2, 3]], [[4, 5, 6]], True, "does not hold"),
-        ([[4, 5, 6]], [[1, 2, 4]], True, "not decided"),
-        ([[4, 5, 6], [7, 8, 9]], [[1, 2, 3], [2, 2, 3.5]], True, "holds"),
-        ([[4, 5, 6], [7, 8, 9]], [[1, 2, 3], [2, 2, 4.5]], True, "not decided"),
-        ([[4, 5, 6], [7, 8, 9]], [[1, 2, 3], [7, 7, 7]], True, "does not hold"),  # one of four comparisons
-        ([[4, 5, 6], [1, 2, 3]], [[1, 2, 3]], False, "contradicted"),
-        ([[4, 5, 6]], [[1, 2, 4]], False, "not contradicted"),
-        ([[1, 2, 3]], [[4, 5, 6]], False, "not contradicted"),
-        ([[4, 5]], [[1, 2]], True, "not decided"),  # two seeds are too few
-        ([[4, 5]], [[1, 2]], False, "not decided"),
+        ([pair(2.0)], True, "holds", 0.01),
+        ([pair(1.9)], True, "not decided", 1.0),
+        ([pair(-2.0)], True, "does not hold", 0.01),
+        ([pair(3, 0.01), pair(4, 0.002)], True, "holds", 0.01),  # all of them are needed
+        ([pair(3), pair(1.9)], True, "not decided", 1.0),
+        ([pair(3), pair(-2.5, 0.02), pair(-3, 0.01)], True, "does not hold", 0.03),  # one of three is enough
+        ([pair(-3), pair(2.1, 0.04)], False, "contradicted", 0.08),
+        ([pair(-3), pair(1.9)], False, "not contradicted", 1.0),
     ],
 )
-def test_verdicts(higher, lower, expects_difference, verdict):
+def test_verdicts(pairs, expects_difference, text, p_value):
     claim = claims.Claim("1", "", claims.ENDLESS, ("GRU",), ("TrXL",), expects_difference=expects_difference)
-    assert claims.verdict(claim, np.array(higher), np.array(lower)) == verdict
+    found = claims.verdict(claim, pairs)
+    assert (found.text, found.p_value) == (text, pytest.approx(p_value))
+
+
+def test_a_comparison_by_hand():
+    """Seeds' means 2 and 4, and 1 and 1: variances 2 and 0. The levels' differences 1 and 3 have one of 2."""
+    higher, lower = np.array([[1.0, 3.0], [3.0, 5.0]]), np.array([[1.0, 1.0], [1.0, 1.0]])
+    found = claims.Comparison.of(higher, lower)
+    assert found.errors == pytest.approx(2 / np.sqrt(2 / 2 + 0 + 2 / 2))
+    assert found.p_value == pytest.approx(2 * scipy.stats.t.sf(np.sqrt(2), 2))
+    assert claims.Comparison.of(lower, higher).errors == -found.errors
+    assert claims.Comparison.of(lower, lower).errors == 0
+    assert claims.Comparison.of(np.array([[3.0], [5.0]]), np.array([[1.0], [1.0]])).errors == pytest.approx(3.0)
+
+
+def test_a_comparison_is_as_often_wrong_as_it_says():
+    """Of two equal agents, three seeds each, on levels that are harder for both."""
+    rng = np.random.default_rng(0)
+    p_values = []
+    for _ in range(2000):
+        higher, lower = rng.normal(0, 1, (2, 3, 1)) + rng.normal(0, 1, 50) + rng.normal(0, 0.1, (2, 3, 50))
+        p_values.append(claims.Comparison.of(higher, lower).p_value)
+    assert np.mean(np.array(p_values) < 0.1) == pytest.approx(0.1, abs=0.03)
+
+
+def test_holm_by_hand():
+    """Of four at 5 %, the smallest has to be below 1.25 %, the next below 1.67 %, then 2.5 % and 5 %."""
+    assert claims.holm([0.04, 0.01, 0.03, 0.016]) == [False, True, False, True]
+    assert claims.holm([0.04, 0.01, 0.025, 0.016]) == [True] * 4
+    assert claims.holm([0.013, 0.9, 0.9, 0.9]) == [False] * 4
+    assert claims.holm([]) == []
+
+
+def test_where_nobody_is_above_an_agent_without_memory_nothing_was_learned():
+    def runs(*means):
+        steps = np.array([100])
+        curves = [{"eval/commands_completed": (steps, np.full((1, 4, 1), mean))} for mean in means]
+        return [claims.evaluate.RunLog("", {}, each) for each in curves]
+
+    claim = claims.CLAIMS["endless"]
+    low, high = runs(1.0, 1.1, 0.9), runs(2.0, 2.1, 1.9)
+    assert claims.is_learned(claim, {"GRU": low, "TrXL": high}, low)
+    assert not claims.is_learned(claim, {"GRU": low, "TrXL": low}, low)
+    assert not claims.is_learned(claim, {"no memory": high, "TrXL": low}, high)
+    assert claims.is_learned(claim, {"GRU": low, "TrXL": low}, []), "not known"
+
+
+def test_short_names():
+    assert claims.short("GTrXL") == "GTrXL"
+    assert claims.short(claims.WIDE_QUERY_POSITION) == "TrXL, query position"
+    assert claims.short(claims.NORMALIZED) == "GRU, target kl None, norm adv minibatch"
 
 
 @pytest.mark.parametrize("name", claims.CLAIMS)
@@ -56,16 +108,19 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     for agent in agents:
         plans = [learning.plan(config, claims.ALL_IN_VIEW, agent, seed) for seed in (1, 2)]
         norms[agent] = [learning.result_of(config, plan).curves["losses/grad_norm"][1].mean() for plan in plans]
-    figures = [f"{agent} {np.mean(x):.3g} ({min(x):.3g} to {max(x):.3g})" for agent, x in norms.items()]
-    row = "| 7.2 | normalized advantages make gradients larger | `normalized-gradients` | gradient norm: "
-    assert told.splitlines()[-1].startswith(row + "; ".join(figures))
+    cells = []
+    for agent in agents:
+        cells.append(f"{claims.short(agent)} {learning.mean_and_error(np.reshape(norms[agent], (2, 1, 1)))}")
+    row = "| normalized advantages make gradients larger (7.2; `normalized-gradients`) | gradient norm | "
+    assert any(line.startswith(row + " | ".join(cells)) for line in told.splitlines())
+    assert told.splitlines()[-1].startswith("Of 1 rows: 1 ")
     claims.main(config)
     assert "trained" not in capsys.readouterr().out
 
     claims.main(replace(config, report=True, seeds=(1, 2, 3)))
     told = capsys.readouterr().out
     assert "trained" not in told
-    assert told.count(" | not tested: 2 of 6 runs are missing |") == 1
+    assert told.count("`normalized-gradients` is not tested: 2 of 6 runs are missing\n") == 1
 
 
 def test_the_page_has_the_rows_of_the_results_that_are_there(capsys):
