@@ -3,6 +3,7 @@
     python benchmarks/learning.py --out docs/learning
     python benchmarks/learning.py --tasks endless-mortar-mayhem --agents GRU TrXL "TrXL, gradient" --steps-scale 6
     python benchmarks/learning.py --suite full --results benchmarks/results
+    python benchmarks/learning.py --results benchmarks/results --csv results.csv
 
 The small suite has tasks that take minutes on a core; the full one has the ten environments as they are. Agents have
 vector observations and small networks, and all see the same vectors, a frame stack the last few. Two sets of levels
@@ -16,6 +17,7 @@ checkpoint in --folder. With --report, nothing is trained.
 """
 
 import contextlib
+import csv
 import functools
 import glob
 import importlib
@@ -225,6 +227,8 @@ class Config(Training):
     further flags, e.g. "TrXL --trxl-num-layers 3" ppo_mingru.py"""
     out: Path = Path("learning/curves")
     """draw the curves to OUT.png and OUT.svg"""
+    csv: Path | None = None
+    """write the scores of all runs in --results to this file, a line for each evaluation, and do nothing else"""
 
 
 def file_name(agent: str) -> str:
@@ -335,6 +339,22 @@ def is_complete(run: evaluate.RunLog) -> bool:
     return run.has_seconds() and run.last_step + math.prod(batch) > total
 
 
+def expected_hours(config: Training, missing: list[Plan]) -> str:
+    """Return about how many hours the trainings take, by the results of the same scripts that are there; or nothing."""
+    speeds = {}
+    for path in config.results.glob("*/*.json.gz"):
+        run = evaluate.read_run(str(path))
+        if run.has_seconds():
+            speeds.setdefault(run.args["script"], []).append(run.last_step / run.seconds("iteration").sum())
+    scripts = [Path(plan.command[1]).stem for plan in missing]
+    if not {*scripts} <= {*speeds}:
+        return ""
+    seconds = sum(
+        plan.args.total_timesteps / np.median(speeds[name]) for plan, name in zip(missing, scripts, strict=True)
+    )
+    return f", about {seconds / 3600 / config.jobs:.1f} hours"
+
+
 RUNNING = set()  # training processes, to be stopped with this one
 STOPPING = threading.Event()
 
@@ -434,6 +454,10 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     missing = [plan for plan in wanted if result_of(config, plan) is None]
     steps = sum(plan.args.total_timesteps for plan in missing)
+    if missing:
+        tqdm.write(
+            f"{len(missing)} runs to train, {steps:,} steps, {config.jobs} at a time{expected_hours(config, missing)}"
+        )
     before = sum(steps_so_far(config, plan) for plan in missing)  # of trainings that were stopped
     failed = []
     with (
@@ -577,11 +601,33 @@ def results_of(config: Config, plans: dict[tuple[str, str, int], Plan]) -> dict[
     return tasks
 
 
+def write_csv(results: Path, path: Path) -> int:
+    """Write the scores of all runs to a table, a line for each evaluation, and return the number of runs."""
+    names = ("env_id", "env_options", "exp_name", "script", "seed")
+    files = sorted(results.glob("*/*.json.gz"))
+    with path.open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow((*names, "levels", "metric", "step", "hours", "mean", "episodes"))
+        for each in files:
+            run = evaluate.read_run(str(each))
+            for curve, (steps, scores) in run.curves.items():
+                levels, _, metric = curve.partition("/")
+                if levels in ("eval", "test"):
+                    about = [run.args[name] for name in names] + [levels.replace("eval", "development"), metric]
+                    hours = run.hours(np.asarray(steps)) if run.has_seconds() else np.full(len(steps), math.nan)
+                    for step, hour, score in zip(steps, hours, scores, strict=True):
+                        table.writerow((*about, step, f"{hour:.4f}", f"{score.mean():.6g}", score.size))
+    return len(files)
+
+
 def main(config: Config) -> None:
     """Train what is missing, then print the tables and draw the curves.
 
     Raises SystemExit as `plans_of` does, for trainings that failed, and if there is nothing to show.
     """
+    if config.csv is not None:
+        print(f"{config.csv}: the scores of {write_csv(config.results, config.csv)} runs")
+        return
     plans = plans_of(config)  # all at once: tyro, which parses their command lines, is not made for several threads
     if not config.report:
         train_missing(config, [*plans.values()])

@@ -314,6 +314,35 @@ def test_a_table_leaves_out_agents_without_runs_and_compares_with_the_best():
         assert note == "Runs: 3, together 0.1 hours without evaluations. Machines: a laptop"
 
 
+def test_results_as_one_table(tmp_path, capsys):
+    args = {"env_id": "X-v0", "env_options": "{}", "exp_name": "GRU", "script": "ppo_gru", "seed": "3"}
+    run = run_with(1, 2, 3, metric="eval/return")
+    seconds = {name: (np.array([100, 200, 300]), np.full((3, 1, 1), 36.0)) for name in evaluate.SECONDS.values()}
+    test = {"test/return": ([300], np.full((1, 7, 1), 2.5))}
+    (tmp_path / "X-v0").mkdir()
+    evaluate.write_run(replace(run, args=args, curves=run.curves | seconds | test), f"{tmp_path}/X-v0/run.json.gz")
+    learning.main(learning.Config(results=tmp_path, csv=tmp_path / "all.csv"))
+    assert capsys.readouterr().out == f"{tmp_path}/all.csv: the scores of 1 runs\n"
+    assert (tmp_path / "all.csv").read_text().splitlines() == [
+        "env_id,env_options,exp_name,script,seed,levels,metric,step,hours,mean,episodes",
+        "X-v0,{},GRU,ppo_gru,3,development,return,100,0.0100,1,8",
+        "X-v0,{},GRU,ppo_gru,3,development,return,200,0.0200,2,8",
+        "X-v0,{},GRU,ppo_gru,3,development,return,300,0.0300,3,8",
+        "X-v0,{},GRU,ppo_gru,3,test,return,300,0.0300,2.5,7",
+    ]
+
+
+def test_hours_of_trainings_are_expected_by_those_that_are_there(tmp_path):
+    config = learning.Config(results=tmp_path, jobs=2)
+    plans = [learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", seed) for seed in (1, 2)]
+    assert learning.expected_hours(config, plans) == ""
+    curves = {name: (np.array([7200]), np.full((1, 1, 1), 36.0)) for name in evaluate.SECONDS.values()}
+    run = evaluate.RunLog("", plans[0].logged_args(), curves)  # 200 steps a second
+    (tmp_path / "X-v0").mkdir()
+    evaluate.write_run(run, f"{tmp_path}/X-v0/run.json.gz")
+    assert learning.expected_hours(config, plans) == ", about 1.4 hours"  # two million steps, two at a time
+
+
 def test_an_overview_says_where_seeds_or_agents_are_missing():
     spotlights = run_with(0, 0, 0.25, metric="eval/success")
     commands = run_with(0, 0, 2, metric="eval/commands_completed")
