@@ -7,7 +7,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
 from helpers import EACH, EACH_OBS, HASTY, check_same, make, roll
 from players import FAMILY
-from test_lanes import CHANGED, LANES, OPTIONS, Told, masked, mixed_actions
+from test_lanes import CHANGED, LANES, OPTIONS, Told, check_resets_and_steps, mixed_actions, reset_both
 
 NEXT, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED
 
@@ -19,34 +19,17 @@ def both(env_id, mode, **arguments):
     return ours, SyncVectorEnv(lanes, autoreset_mode=mode)
 
 
-def reset_both(ours, theirs, seed=None, options=None, mask=None):
-    for lane in range(LANES) if mask is None else np.flatnonzero(mask):
-        theirs.envs[lane].options = options
-    check_same(*(envs.reset(seed=seed, options=masked(options, mask)) for envs in (ours, theirs)))
-
-
 @EACH_OBS
 @pytest.mark.parametrize("levels", [{}, {"num_levels": 3, "start_level": 40}], ids=["any level", "3 levels"])
 def test_next_step_is_gymnasiums(env_id, obs_type, levels):
     ours, theirs = both(env_id, NEXT, obs_type=obs_type, **levels)
-    rng, ended = np.random.default_rng(0), 0
     resets = [
         (11, HASTY[FAMILY[env_id]], None),
         ([5, None, 6, None, 0], OPTIONS[env_id], None),
         (None, CHANGED[FAMILY[env_id]], np.array([True, False, False, True, False])),  # some in the wait for a reset
         (None, None, None),
     ]
-    for seed, options, mask in resets:
-        reset_both(ours, theirs, seed, options, mask)
-        for _ in range(80):
-            actions = mixed_actions(ours, rng)
-            result = ours.step(actions)
-            check_same(result, theirs.step(actions))
-            ended += np.count_nonzero(result[2] | result[3])
-        for lane in range(LANES):
-            assert ours.np_random_seed[lane] == theirs.np_random_seed[lane]
-            assert ours.np_random[lane].bit_generator.state == theirs.np_random[lane].bit_generator.state
-    assert ended > LANES
+    check_resets_and_steps(ours, theirs, resets)
 
 
 @EACH
@@ -71,7 +54,7 @@ def test_without_autoreset_the_caller_resets(env_id):
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, NEXT])
 def test_limit_of_steps_is_gymnasiums(env_id, mode):
     ours, theirs = both(env_id, mode, max_episode_steps=23)
-    reset_both(ours, theirs, 0)
+    reset_both(ours, theirs, 0, None)
     rng, limits = np.random.default_rng(0), 0
     for _ in range(80):
         actions = mixed_actions(ours, rng)

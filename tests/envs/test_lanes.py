@@ -70,6 +70,22 @@ def masked(options, mask):
     return options if mask is None else {**(options or {}), "reset_mask": mask}
 
 
+def check_resets_and_steps(ours, theirs, resets):
+    """Both return the same after each reset (seed, options, mask), and in the steps that follow it."""
+    rng, ended = np.random.default_rng(0), 0
+    for seed, given, mask in resets:
+        reset_both(ours, theirs, seed, given, mask)
+        for _ in range(80):
+            actions = mixed_actions(ours, rng)
+            result = ours.step(actions)
+            check_same(result, theirs.step(actions))
+            ended += np.count_nonzero(result[2] | result[3])
+        for lane in range(LANES):
+            assert ours.np_random_seed[lane] == theirs.np_random_seed[lane]
+            assert ours.np_random[lane].bit_generator.state == theirs.np_random[lane].bit_generator.state
+    assert ended > LANES
+
+
 def mixed_actions(envs, rng) -> np.ndarray:
     """Players that stumble, the later lanes ever more often, so that episodes of all lengths occur."""
     return stumbling(envs, rng, np.linspace(0.1, 1.0, envs.num_envs))
@@ -89,18 +105,7 @@ def test_as_gymnasiums_own(env_id, obs_type, levels):
         ([None, 7, 8, 9, None], None, np.array([False, True, False, False, True])),
         (None, None, None),
     ]
-    rng, ended = np.random.default_rng(0), 0
-    for seed, given, mask in resets:
-        reset_both(ours, theirs, seed, given, mask)
-        for _ in range(80):
-            actions = mixed_actions(ours, rng)
-            result = ours.step(actions)
-            check_same(result, theirs.step(actions))
-            ended += np.count_nonzero(result[2] | result[3])
-        for lane in range(LANES):
-            assert ours.np_random_seed[lane] == theirs.np_random_seed[lane]
-            assert ours.np_random[lane].bit_generator.state == theirs.np_random[lane].bit_generator.state
-    assert ended > LANES
+    check_resets_and_steps(ours, theirs, resets)
 
 
 @EACH_OBS
