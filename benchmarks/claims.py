@@ -24,7 +24,6 @@ With --report nothing is trained, and a claim is not tested if runs are missing.
 
 import itertools
 import math
-import re
 import signal
 import sys
 from collections import Counter
@@ -40,7 +39,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other pac
 
 import evaluate
 import learning
-from learning import TASKS, Task
+import suites
+import tables
+from suites import TASKS, Task
 
 MORTAR_MAYHEM, MYSTERY_PATH = TASKS["mortar-mayhem"], TASKS["mystery-path"]
 FULL_MORTAR_MAYHEM, FREE_MORTAR_MAYHEM = TASKS["MortarMayhem-Grid-v0"], TASKS["MortarMayhem-v0"]
@@ -62,8 +63,8 @@ ALL_IN_VIEW = Task(
 DECIDED = 2.0  # standard errors of a difference
 FEW_FRAMES = ("no memory", "stack of 4", "step encoding")
 # With about as many parameters as the GRU: the thesis' transformer and GTrXL, and one whose queries know their step.
-WIDE_TRXL, WIDE_GTRXL = f"TrXL {learning.WIDE}", f"GTrXL {learning.WIDE}"
-WIDE_QUERY_POSITION = f"TrXL --trxl-query-position {learning.WIDE}"
+WIDE_TRXL, WIDE_GTRXL = f"TrXL {suites.WIDE}", f"GTrXL {suites.WIDE}"
+WIDE_QUERY_POSITION = f"TrXL --trxl-query-position {suites.WIDE}"
 # The thesis' learning rate is at its final value after a fifth of the training: of the steps of ENDLESS, unless
 # --steps-scale changes them.
 TO_1E_4, TO_1E_5 = "TrXL --anneal-steps 200000", "TrXL --anneal-steps 200000 --final-lr 1e-5"
@@ -74,7 +75,7 @@ NOT_NORMALIZED, NORMALIZED = "GRU --target-kl None", "GRU --target-kl None --nor
 # What is compared, (R, M): of each seed, on each level.
 def score(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
     """Return the scores of the final weights."""
-    return learning.final_scores(task.score, runs).mean(-1)
+    return tables.final_scores(task.score, runs).mean(-1)
 
 
 def area(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
@@ -84,7 +85,7 @@ def area(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
 
 def falls(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
     """Return how often the final weights fall off."""
-    return learning.final_scores("num_fails", runs).mean(-1)
+    return tables.final_scores("num_fails", runs).mean(-1)
 
 
 def gradient_norm(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
@@ -374,19 +375,13 @@ def holm(p_values: list[float], level: float = 0.05) -> list[bool]:
     return passed[np.argsort(order)].tolist()
 
 
-def short(agent: str) -> str:
-    """Return an agent's name for the table: its flags in words, without those that make a transformer wide."""
-    name = agent.replace(f" {learning.WIDE}", "")
-    return re.sub(r" --(?:trxl-)?([\w-]+)", lambda found: f", {found[1].replace('-', ' ')}", name)
-
-
 def row(name: str, runs: dict[str, list[evaluate.RunLog]], found: str) -> str:
     """Return a claim's row of the table, from the seeds of its agents: their means and standard errors."""
     claim = CLAIMS[name]
 
     def cell(agents: tuple[str, ...]) -> str:
-        numbers = {short(agent): claim.measure(claim.task, runs[agent])[..., None] for agent in agents}
-        return ", ".join(f"{agent} {learning.mean_and_error(each)}" for agent, each in numbers.items())
+        numbers = {suites.short(agent): claim.measure(claim.task, runs[agent])[..., None] for agent in agents}
+        return ", ".join(f"{agent} {tables.mean_and_error(each)}" for agent, each in numbers.items())
 
     measure = claim.measure.__name__.replace("_", " ")
     text = f"{claim.text} ({claim.section}; `{name}`)"

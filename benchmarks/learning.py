@@ -1,11 +1,11 @@
 """Does memory matter, and which one? Trains agents on a suite of tasks, and tabulates what they reach.
 
-    python benchmarks/learning.py --out docs/learning
+    python benchmarks/learning.py --out docs/learning.png
     python benchmarks/learning.py --tasks endless-mortar-mayhem --agents GRU TrXL "TrXL, gradient" --steps-scale 6
     python benchmarks/learning.py --suite full --results benchmarks/results
     python benchmarks/learning.py --results benchmarks/results --csv results.csv
 
-The small suite has tasks that take minutes on a core; the full one has the ten environments as they are. Agents have
+The small suite has tasks that take minutes on a core, the full one the ten environments as they are. Agents have
 vector observations and small networks, and all see the same vectors, a frame stack the last few. Two sets of levels
 are outside of the training set. Evaluations during training (6.1.3) are on the development levels, which follow the
 training's: curves are made of them, settings and seeds chosen by them. At the end, the final weights play TEST_LEVELS
@@ -32,7 +32,7 @@ import sys
 import threading
 import zlib
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -44,154 +44,14 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
 
 import evaluate
+import tables
 from ppo_utils.flags import check_args, check_minibatches
 from ppo_utils.runs import parse_args
+from suites import AGENTS, SUITES, TASKS, Task, short
 
 ROOT = Path(__file__).parent.parent
 COMMON = "--preset laptop --save-model"
 TEST_LEVELS, FIRST_TEST_LEVEL = 1000, 1_000_000
-# What --preset laptop was until Muon, with which the agents of the two suites have been trained.
-ADAMW = "--optimizer adamw --no-norm-reward --num-envs 32 --update-epochs 4 --num-minibatches 8"
-ADAMW += " --init-lr 1e-3 --final-lr 1e-4 --init-ent-coef 5e-4 --final-ent-coef 5e-5"
-GRU, ADAMW_TRXL = f"ppo_gru.py {ADAMW}", f"ppo_trxl.py {ADAMW} --trxl-dim 64 --trxl-memory-length 128"
-TRXL = f"{ADAMW_TRXL} --no-trxl-query-position --no-trxl-memory-gradient"  # the thesis', where the preset differs
-MEMORIES = {
-    "GRU": f"{GRU} --memory gru",
-    "LSTM": f"{GRU} --memory lstm",
-    "TrXL": TRXL,
-    "GTrXL": f"{TRXL} --trxl-gate gru",
-}
-# The thesis' exploration bonus, with the weights that suit it on these tasks; the preset has the log barrier.
-ENTROPY = "--exploration-bonus entropy --init-ent-coef 1e-3 --final-ent-coef 1e-4"
-AGENTS = {
-    "no memory": f"{GRU} --memory none",
-    "stack of 4": f"{GRU} --memory none --frame-stack 4",
-    "stack of 16": f"{GRU} --memory none --frame-stack 16",
-    "step encoding": f"{GRU} --memory none --step-encoding",
-    **MEMORIES,
-    "TrXL, preset": ADAMW_TRXL,
-    "no memory, Muon": "ppo_gru.py --memory none",  # today's --preset laptop
-    "GRU, Muon": "ppo_gru.py",
-    "TrXL, Muon": "ppo_trxl.py",
-    **{f"{name}, entropy": f"{flags} {ENTROPY}" for name, flags in MEMORIES.items()},
-    **{f"{name}, refreshed": f"{flags} --refresh-memory" for name, flags in MEMORIES.items()},
-    **{f"{name}, gradient": f"{MEMORIES[name]} --trxl-memory-gradient" for name in ("TrXL", "GTrXL")},
-    **{
-        f"{name}, gradient, refreshed": f"{MEMORIES[name]} --trxl-memory-gradient --refresh-memory"
-        for name in ("TrXL", "GTrXL")
-    },
-}
-
-
-@dataclass(frozen=True)
-class Task:
-    """A task, and how it is learned."""
-
-    env_id: str
-    total_timesteps: int
-    options: dict = field(default_factory=dict)
-    flags: str = ""
-    trxl_flags: str = ""  # the transformer's own
-
-    @property
-    def title(self) -> str:
-        """Return the environment's id, and the reset options if they are not the default ones."""
-        return f"{self.env_id} {json.dumps(self.options)}" if self.options else self.env_id
-
-    @property
-    def metric(self) -> str:
-        """Return the name of the family's own metric (6.1.3)."""
-        return evaluate.own_metric(self.env_id)
-
-    @property
-    def best_return(self) -> float | None:
-        """Return what all commands of a finite Mortar Mayhem pay, None for other tasks."""
-        return 0.1 * self.options.get("command_count", [10])[0] if self.env_id.startswith("MortarMayhem") else None
-
-    @property
-    def best_score(self) -> float | None:
-        """Return the best score that is possible, None where there is no bound."""
-        return 1.0 if self.score in ("carried_out", "success") else None
-
-    @property
-    def score(self) -> str:
-        """Return the name of the score by which agents are compared: the metric, or what they carried out.
-
-        That is a finite Mortar Mayhem's share of the commands by the return (`result_of`). Its metric, as the
-        original's, counts a last command as completed even if it failed.
-        """
-        return self.metric if self.best_return is None else "carried_out"
-
-
-SMALL = {
-    "mortar-mayhem": Task(
-        "MortarMayhem-Grid-v0",
-        1_000_000,
-        # Four commands instead of ten, each shown for one step, and two thirds of the time to carry one out.
-        {
-            "command_count": [4],
-            "command_show_duration": [1],
-            "command_show_delay": [0],
-            "explosion_delay": [4],
-            "explosion_duration": [2],
-        },
-    ),
-    "mystery-path": Task(
-        "MysteryPath-Grid-v0",
-        1_500_000,
-        # All paths begin at the left, and each of their tiles pays a tenth of the goal's reward when first reached:
-        # without this, chance finds too few goals.
-        {"cardinal_origin_choice": [0], "reward_path_progress": 0.1},
-        # To remember tiles, an agent has to tell them apart; their coordinates alone differ by a seventh.
-        "--vector-frequencies 4",
-        # Where the agent fell matters, not when.
-        "--trxl-positional-encoding none",
-    ),
-    "endless-mortar-mayhem": Task(
-        "Endless-MortarMayhem-v0",
-        1_000_000,
-        # A step crosses a tile, as on the grid; a new command is shown for one step, and carrying one out takes four:
-        # an episode with twenty commands carried out has about ninety steps.
-        {
-            "agent_speed": 14,
-            "allowed_commands": 5,
-            "explosion_delay": [3],
-            "explosion_duration": [1],
-            "command_show_duration": [1],
-            "command_show_delay": [0],
-        },
-    ),
-}
-FULL = {  # trained for what two cores can do in a day, all agents and seeds together; few agents converge
-    # As in the small task, an agent has to tell tiles apart to remember them.
-    env_id: Task(env_id, 1_000_000 * millions, flags="--vector-frequencies 4" if "MysteryPath" in env_id else "")
-    for env_id, millions in {
-        "MortarMayhem-v0": 3,
-        "MortarMayhem-Grid-v0": 6,
-        "MortarMayhemB-v0": 2,
-        "MortarMayhemB-Grid-v0": 1,
-        "Endless-MortarMayhem-v0": 6,
-        "MysteryPath-v0": 3,
-        "MysteryPath-Grid-v0": 3,
-        "Endless-MysteryPath-v0": 3,
-        "SearingSpotlights-v0": 3,
-        "Endless-SearingSpotlights-v0": 3,
-    }.items()
-}
-# A transformer with about as many parameters as the GRU.
-WIDE = "--trxl-dim 96 --trxl-memory-length 256 --init-lr 5e-4"
-TASKS = SMALL | FULL
-SUITES = {  # tasks, and agents by the names that tables and pictures have for them
-    "small": (
-        SMALL,
-        {name: name for name in ("no memory", "stack of 4", "stack of 16", "GRU", "TrXL", "TrXL, preset")},
-    ),
-    "full": (
-        FULL,
-        {name: name for name in ("no memory", "stack of 4", "stack of 16", "step encoding", "GRU", "LSTM")}
-        | {name: f"{name} {WIDE}" for name in ("TrXL", "GTrXL", "TrXL, preset")},
-    ),
-}
 
 
 @dataclass
@@ -218,15 +78,18 @@ class Training:
 class Config(Training):
     """What to train and to draw."""
 
-    suite: Literal["small", "full"] = "small"
-    """tasks that are learned within minutes, or the ten environments with their default options"""
+    suite: Literal["small", "full", "laptop"] = "small"
+    """tasks that are learned within minutes, the ten environments with their default options, or these with the agents
+    that --preset laptop trains"""
     tasks: tuple[str, ...] = ()
     """other tasks than the suite's, of those that this program knows"""
     agents: tuple[str, ...] = ()
     """other agents than the suite's: those that this program knows, or scripts beside ppo_gru.py, each alone or with
     further flags, e.g. "TrXL --trxl-num-layers 3" ppo_mingru.py"""
-    out: Path = Path("learning/curves")
-    """draw the curves to OUT.png and OUT.svg"""
+    out: Path = Path("learning/curves.png")
+    """draw the curves to this file"""
+    draw: tuple[str, ...] = ()
+    """the agents whose curves to draw, all by default"""
     csv: Path | None = None
     """write the scores of all runs in --results to this file, a line for each evaluation, and do nothing else"""
 
@@ -488,87 +351,6 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
         raise SystemExit("; ".join(failed))
 
 
-def row(agent: str, runs: list[evaluate.RunLog], task: Task, best: float) -> str:
-    """Return the agent's row: its score, that of each seed, the largest drop, and the minutes to 0.5 and 0.9 of `best`.
-
-    Drops and minutes are those of the curve on development levels. A drop is how far a seed's mean is below an earlier
-    one. If the task's score is not its metric, the mean of the metric stands behind the score.
-    """
-    scores = final_scores(task.score, runs)  # (R, M, E)
-    steps, curve = evaluate.align([run.curves[f"eval/{task.score}"] for run in runs])  # (P,), (P, R, M, E)
-    minutes = 60 * np.mean([run.hours(steps) for run in runs], 0)  # (P,), without evaluations
-    means = curve.mean((-2, -1))  # (P, R)
-    drop = (np.maximum.accumulate(means) - means).max()
-    cells = [agent, mean_and_error(scores), f"{evaluate.iqm(scores):.2f}"]
-    cells.append(", ".join(f"{mean:.2f}" for mean in scores.mean((1, 2))))
-    if task.score != task.metric:
-        cells.append(f"{final_scores(task.metric, runs).mean():.2f}")
-    cells.append(f"{drop:.2f}")
-    for share in (0.5, 0.9):
-        there = np.flatnonzero(means.mean(1) >= share * best)
-        cells.append(f"{minutes[there[0]]:.1f}" if there.size and best else "")
-    return f"| {' | '.join(cells)} | {minutes[-1]:.1f} |"
-
-
-def mean_and_error(scores: np.ndarray) -> str:
-    """Return the mean of scores (R, M, E) with its standard error, if there are several seeds."""
-    error = evaluate.standard_error(scores)
-    return f"{scores.mean():.2f}" + ("" if math.isnan(error) else f" ± {error:.2f}")
-
-
-def final_scores(name: str, runs: list[evaluate.RunLog]) -> np.ndarray:
-    """Return the scores (R, M, E) of the seeds' final weights, by the name of a metric or score.
-
-    They are those on the test levels, or where a run has none, on the development levels.
-    """
-    levels = "test" if all(f"test/{name}" in run.curves for run in runs) else "eval"
-    return evaluate.align([run.curves[f"{levels}/{name}"] for run in runs])[1][-1]
-
-
-def table(task: Task, agents: evaluate.Runs) -> str:
-    """Return a task's table, a row for each agent that has runs, and below it what these took and on which machines.
-
-    The best is the best possible score, or where there is no bound the highest mean of these agents.
-    """
-    runs_of = {agent: runs for agent, runs in agents.items() if runs}
-    best = task.best_score or max(float(final_scores(task.score, runs).mean()) for runs in runs_of.values())
-    every_run = [run for runs in runs_of.values() for run in runs]
-    hours = sum(run.seconds("iteration").sum() for run in every_run) / 3600
-    machines = "; ".join(dict.fromkeys(run.machine for run in every_run))
-    metric = () if task.score == task.metric else (task.metric,)
-    taken = ("largest drop", "minutes to 0.5 of the best", "minutes to 0.9", "minutes")
-    header = ("agent", "mean", "IQM", "each seed", *metric, *taken)
-    lines = [
-        f"{task.score} after {int(every_run[0].args['total_timesteps']):,} steps\n",
-        f"| {' | '.join(header)} |",
-        f"|{'|'.join('---' if name in ('agent', 'each seed') else '---:' for name in header)}|",
-        *(row(agent, runs, task, best) for agent, runs in runs_of.items()),
-        f"\nRuns: {len(every_run)}, together {hours:.1f} hours without evaluations. Machines: {machines}",
-    ]
-    return "\n".join(lines)
-
-
-def overview(tasks: dict[str, evaluate.Runs]) -> str:
-    """Return a table with a row for each task: the mean score of each agent's final weights, and its standard error.
-
-    Where an agent has fewer seeds than others, it says how many; where it has none, there is no number.
-    """
-    names = [*dict.fromkeys(agent for agents in tasks.values() for agent in agents)]
-    most = max(len(runs) for agents in tasks.values() for runs in agents.values())
-
-    def cell(task: Task, runs: list[evaluate.RunLog]) -> str:
-        if not runs:
-            return ""
-        few = f", {len(runs)} seed{'s' * (len(runs) > 1)}" if len(runs) < most else ""
-        return mean_and_error(final_scores(task.score, runs)) + few
-
-    lines = [f"| task, score | {' | '.join(names)} |", f"|---|{'---:|' * len(names)}"]
-    for task, agents in tasks.items():
-        cells = [cell(TASKS[task], agents.get(name, [])) for name in names]
-        lines.append(f"| {task}, {TASKS[task].score} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
 def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
     """Return the trainings that are wanted, by task, the agent's name in tables, and seed.
 
@@ -577,7 +359,8 @@ def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
     check(config)
     suite_tasks, suite_agents = SUITES[config.suite]
     tasks = config.tasks or suite_tasks
-    agents = {name: suite_agents.get(name, name) for name in config.agents} or suite_agents
+    of_suite = {short(agent): agent for agent in suite_agents}
+    agents = {short(name): of_suite.get(name.replace(", preset", "+"), name) for name in config.agents} or of_suite
     scripts = {path.name: path for path in ROOT.glob("ppo_*.py")}
     names = [agent.partition(" --")[0] for agent in agents.values()]
     for given, known in ((tasks, TASKS), (names, AGENTS | scripts)):
@@ -635,16 +418,18 @@ def main(config: Config) -> None:
     found = {name: agents for name, agents in tasks.items() if any(agents.values())}
     if not found:
         raise SystemExit(f"{config.results} has no results of these agents; without --report they are trained")
-    if len(found) > 1:
-        print(f"{overview(found)}\n")
+    bounds = tables.read_bounds()
+    for text in (tables.overview(found, bounds), tables.aggregate(found, bounds)):
+        print(f"{text}\n" if text else "")
     for name, agents in found.items():
-        print(f"## {TASKS[name].title}\n\n{table(TASKS[name], agents)}\n")
+        print(f"## {TASKS[name].title}\n\n{tables.table(TASKS[name], agents)}\n")
     for name, agents in tasks.items():
         lacking = {agent: len(config.seeds) - len(runs) for agent, runs in agents.items()}
         if missing := [f"{count} of {agent}" for agent, count in lacking.items() if count]:
             print(f"{name}: runs without a result: {'; '.join(missing)}")
-    by_title = {TASKS[name].title: agents for name, agents in found.items()}
-    evaluate.draw_tasks(by_title, str(config.out), {TASKS[name].title: (TASKS[name].score,) for name in found})
+    wanted = config.draw or tuple(dict.fromkeys(agent for agents in found.values() for agent in agents))
+    drawn = {name: {agent: agents[agent] for agent in wanted if agent in agents} for name, agents in found.items()}
+    tables.draw(drawn, config.out)
 
 
 if __name__ == "__main__":

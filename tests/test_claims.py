@@ -9,6 +9,8 @@ import scipy.stats
 
 import claims
 import learning
+import suites
+import tables
 
 ROOT = Path(__file__).parents[1]
 
@@ -80,9 +82,9 @@ def test_where_nobody_is_above_an_agent_without_memory_nothing_was_learned():
 
 
 def test_short_names():
-    assert claims.short("GTrXL") == "GTrXL"
-    assert claims.short(claims.WIDE_QUERY_POSITION) == "TrXL, query position"
-    assert claims.short(claims.NORMALIZED) == "GRU, target kl None, norm adv minibatch"
+    assert suites.short("GTrXL") == "GTrXL"
+    assert suites.short(claims.WIDE_QUERY_POSITION) == "TrXL, query position"
+    assert suites.short(claims.NORMALIZED) == "GRU, target kl None, norm adv minibatch"
 
 
 @pytest.mark.parametrize("name", claims.CLAIMS)
@@ -94,7 +96,7 @@ def test_every_claim_compares_agents_that_can_be_trained(name):
 
 def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     small = "--num-envs 2 --num-steps 32 --num-minibatches 2 --trunk-size 8 --eval-levels 2"
-    agents = {name: f"{flags} {small}" for name, flags in learning.AGENTS.items()}
+    agents = {name: f"{flags} {small}" for name, flags in suites.AGENTS.items()}
     monkeypatch.setattr(learning, "AGENTS", agents)
     config = claims.Config(
         claims=("normalized-gradients",), steps_scale=64 / 1e6, seeds=(1, 2), evaluations=1, folder=tmp_path / "runs"
@@ -110,7 +112,7 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
         norms[agent] = [learning.result_of(config, plan).curves["losses/grad_norm"][1].mean() for plan in plans]
     cells = []
     for agent in agents:
-        cells.append(f"{claims.short(agent)} {learning.mean_and_error(np.reshape(norms[agent], (2, 1, 1)))}")
+        cells.append(f"{suites.short(agent)} {tables.mean_and_error(np.reshape(norms[agent], (2, 1, 1)))}")
     row = "| normalized advantages make gradients larger (7.2; `normalized-gradients`) | gradient norm | "
     assert any(line.startswith(row + " | ".join(cells)) for line in told.splitlines())
     assert told.splitlines()[-1].startswith("Of 1 rows: 1 ")

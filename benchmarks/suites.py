@@ -1,0 +1,170 @@
+"""Tasks and agents that learning.py and claims.py train, by the names that tables and pictures have for them."""
+
+import json
+import re
+from dataclasses import dataclass, field
+
+import evaluate
+
+# What --preset laptop was until Muon: the agents of the suites small and full have these settings.
+ADAMW = "--optimizer adamw --no-norm-reward --num-envs 32 --update-epochs 4 --num-minibatches 8"
+ADAMW += " --init-lr 1e-3 --final-lr 1e-4 --init-ent-coef 5e-4 --final-ent-coef 5e-5"
+GRU, ADAMW_TRXL = f"ppo_gru.py {ADAMW}", f"ppo_trxl.py {ADAMW} --trxl-dim 64 --trxl-memory-length 128"
+TRXL = f"{ADAMW_TRXL} --no-trxl-query-position --no-trxl-memory-gradient"  # the thesis', where the preset differs
+MEMORIES = {
+    "GRU": f"{GRU} --memory gru",
+    "LSTM": f"{GRU} --memory lstm",
+    "TrXL": TRXL,
+    "GTrXL": f"{TRXL} --trxl-gate gru",
+}
+# The thesis' exploration bonus, with the weights that suit it on these tasks; the preset has the log barrier.
+ENTROPY = "--exploration-bonus entropy --init-ent-coef 1e-3 --final-ent-coef 1e-4"
+AGENTS = {
+    "no memory": f"{GRU} --memory none",
+    "stack of 4": f"{GRU} --memory none --frame-stack 4",
+    "stack of 16": f"{GRU} --memory none --frame-stack 16",
+    "step encoding": f"{GRU} --memory none --step-encoding",
+    **MEMORIES,
+    "TrXL, preset": ADAMW_TRXL,
+    "no memory, Muon": "ppo_gru.py --memory none",  # today's --preset laptop
+    "GRU, Muon": "ppo_gru.py",
+    "TrXL, Muon": "ppo_trxl.py",
+    **{f"{name}, entropy": f"{flags} {ENTROPY}" for name, flags in MEMORIES.items()},
+    **{f"{name}, refreshed": f"{flags} --refresh-memory" for name, flags in MEMORIES.items()},
+    **{f"{name}, gradient": f"{MEMORIES[name]} --trxl-memory-gradient" for name in ("TrXL", "GTrXL")},
+    **{
+        f"{name}, gradient, refreshed": f"{MEMORIES[name]} --trxl-memory-gradient --refresh-memory"
+        for name in ("TrXL", "GTrXL")
+    },
+}
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task, and how it is learned."""
+
+    env_id: str
+    total_timesteps: int
+    options: dict = field(default_factory=dict)
+    flags: str = ""
+    trxl_flags: str = ""  # the transformer's own
+
+    @property
+    def title(self) -> str:
+        """Return the environment's id, and the reset options if they are not the default ones."""
+        return f"{self.env_id} {json.dumps(self.options)}" if self.options else self.env_id
+
+    @property
+    def metric(self) -> str:
+        """Return the name of the family's own metric (6.1.3)."""
+        return evaluate.own_metric(self.env_id)
+
+    @property
+    def best_return(self) -> float | None:
+        """Return what all commands of a finite Mortar Mayhem pay, None for other tasks."""
+        return 0.1 * self.options.get("command_count", [10])[0] if self.env_id.startswith("MortarMayhem") else None
+
+    @property
+    def best_score(self) -> float | None:
+        """Return the best score that is possible, None where there is no bound."""
+        return 1.0 if self.score in ("carried_out", "success") else None
+
+    @property
+    def score(self) -> str:
+        """Return the name of the score by which agents are compared: the metric, or what they carried out.
+
+        That is a finite Mortar Mayhem's share of the commands by the return (`result_of`). Its metric, as the
+        original's, counts a last command as completed even if it failed.
+        """
+        return self.metric if self.best_return is None else "carried_out"
+
+
+SMALL = {
+    "mortar-mayhem": Task(
+        "MortarMayhem-Grid-v0",
+        1_000_000,
+        # Four commands instead of ten, each shown for one step, and two thirds of the time to carry one out.
+        {
+            "command_count": [4],
+            "command_show_duration": [1],
+            "command_show_delay": [0],
+            "explosion_delay": [4],
+            "explosion_duration": [2],
+        },
+    ),
+    "mystery-path": Task(
+        "MysteryPath-Grid-v0",
+        1_500_000,
+        # All paths begin at the left, and each of their tiles pays a tenth of the goal's reward when first reached:
+        # without this, chance finds too few goals.
+        {"cardinal_origin_choice": [0], "reward_path_progress": 0.1},
+        # To remember tiles, an agent has to tell them apart; their coordinates alone differ by a seventh.
+        "--vector-frequencies 4",
+        # Where the agent fell matters, not when.
+        "--trxl-positional-encoding none",
+    ),
+    "endless-mortar-mayhem": Task(
+        "Endless-MortarMayhem-v0",
+        1_000_000,
+        # A step crosses a tile, as on the grid; a new command is shown for one step, and carrying one out takes four:
+        # an episode with twenty commands carried out has about ninety steps.
+        {
+            "agent_speed": 14,
+            "allowed_commands": 5,
+            "explosion_delay": [3],
+            "explosion_duration": [1],
+            "command_show_duration": [1],
+            "command_show_delay": [0],
+        },
+    ),
+}
+FULL = {  # trained for what two cores can do in a day, all agents and seeds together; few agents converge
+    # As in the small task, an agent has to tell tiles apart to remember them.
+    env_id: Task(env_id, 1_000_000 * millions, flags="--vector-frequencies 4" if "MysteryPath" in env_id else "")
+    for env_id, millions in {
+        "MortarMayhem-v0": 3,
+        "MortarMayhem-Grid-v0": 6,
+        "MortarMayhemB-v0": 2,
+        "MortarMayhemB-Grid-v0": 1,
+        "Endless-MortarMayhem-v0": 6,
+        "MysteryPath-v0": 3,
+        "MysteryPath-Grid-v0": 3,
+        "Endless-MysteryPath-v0": 3,
+        "SearingSpotlights-v0": 3,
+        "Endless-SearingSpotlights-v0": 3,
+    }.items()
+}
+# In the full tasks, transformers have about as many parameters as the GRU.
+WIDE = "--trxl-dim 96 --trxl-memory-length 256 --init-lr 5e-4"
+TASKS = SMALL | FULL
+SUITES = {  # tasks and agents
+    "small": (
+        SMALL,
+        ("no memory", "stack of 4", "stack of 16", "GRU", "TrXL", "TrXL, preset"),
+    ),
+    "full": (
+        FULL,
+        (
+            *("no memory", "stack of 4", "stack of 16", "step encoding", "GRU", "LSTM"),
+            *(f"{name} {WIDE}" for name in ("TrXL", "GTrXL", "TrXL, preset")),
+        ),
+    ),
+    "laptop": (FULL, ("no memory, Muon", "GRU, Muon", "TrXL, Muon")),
+}
+COLORS = {  # an agent has the same in every picture
+    "no memory": "tab:gray",
+    "stack of 4": "tab:olive",
+    "stack of 16": "tab:brown",
+    "step encoding": "tab:pink",
+    "GRU": "tab:blue",
+    "LSTM": "tab:cyan",
+    "TrXL": "tab:orange",
+    "GTrXL": "tab:purple",
+    "TrXL+": "tab:red",
+}
+
+
+def short(agent: str) -> str:
+    """Return an agent's name for tables: its flags in words, without those that make a transformer wide."""
+    name = agent.replace(f" {WIDE}", "").replace("TrXL, preset", "TrXL+").replace("TrXL, Muon", "TrXL+, Muon")
+    return re.sub(r" --(?:trxl-)?([\w-]+)", lambda found: f", {found[1].replace('-', ' ')}", name)

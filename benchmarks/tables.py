@@ -1,0 +1,247 @@
+"""Tables and pictures of what agents reached, and how they compare over several tasks.
+
+Shape letters, beside those of evaluate.py (R seeds, M levels, E episodes, P points of a curve, B resamples): T tasks.
+"""
+
+import csv
+import itertools
+import math
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import color_sequences
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+import evaluate
+from suites import COLORS, TASKS, Task
+
+BOUNDS = Path(__file__).with_name("bounds.csv")
+RIVALS = ("no memory", "GRU")  # with which the others are compared over all tasks
+NAMES_APART = 0.075  # between the names at the curves' ends, as a share of the axis
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Mean scores on the test levels that benchmarks/bounds.py found."""
+
+    random: float  # of random actions
+    scripted: float  # of a player that sees the whole state
+
+
+def read_bounds(path: Path = BOUNDS) -> dict[str, Bounds]:
+    """Read what benchmarks/bounds.py wrote, by task."""
+    with path.open(newline="") as file:
+        return {row["task"]: Bounds(float(row["random"]), float(row["scripted"])) for row in csv.DictReader(file)}
+
+
+def final_scores(name: str, runs: list[evaluate.RunLog]) -> np.ndarray:
+    """Return the scores (R, M, E) of the seeds' final weights, by the name of a metric or score.
+
+    They are those on the test levels, or where a run has none, on the development levels.
+    """
+    levels = "test" if all(f"test/{name}" in run.curves for run in runs) else "eval"
+    return evaluate.align([run.curves[f"{levels}/{name}"] for run in runs])[1][-1]
+
+
+def mean_and_error(scores: np.ndarray) -> str:
+    """Return the mean of scores (R, M, E) with its standard error, if there are several seeds."""
+    error = evaluate.standard_error(scores)
+    return f"{scores.mean():.2f}" + ("" if math.isnan(error) else f" ± {error:.2f}")
+
+
+def minutes_of(runs: list[evaluate.RunLog]) -> float:
+    """Return the mean duration of trainings, without evaluations."""
+    return float(np.mean([run.seconds("iteration").sum() for run in runs])) / 60
+
+
+def best_of(task: Task, agents: evaluate.Runs) -> float:
+    """Return the best possible score, or where there is no bound the highest mean of these agents."""
+    return task.best_score or max(float(final_scores(task.score, runs).mean()) for runs in agents.values() if runs)
+
+
+# ---- ONE TASK ----
+def table(task: Task, agents: evaluate.Runs) -> str:
+    """Return a task's table, a row for each agent that has runs, and below it what these took and on which machines."""
+    runs_of = {agent: runs for agent, runs in agents.items() if runs}
+    best = best_of(task, runs_of)
+    every_run = [run for runs in runs_of.values() for run in runs]
+    hours = sum(run.seconds("iteration").sum() for run in every_run) / 3600
+    machines = "; ".join(dict.fromkeys(run.machine for run in every_run))
+    metric = () if task.score == task.metric else (task.metric,)
+    taken = ("largest drop", "minutes to 0.5 of the best", "minutes to 0.9", "minutes")
+    header = ("agent", "mean", "IQM", "each seed", *metric, *taken)
+    lines = [
+        f"{task.score} after {int(every_run[0].args['total_timesteps']):,} steps\n",
+        f"| {' | '.join(header)} |",
+        f"|{'|'.join('---' if name in ('agent', 'each seed') else '---:' for name in header)}|",
+        *(row(agent, runs, task, best) for agent, runs in runs_of.items()),
+        f"\nRuns: {len(every_run)}, together {hours:.1f} hours without evaluations. Machines: {machines}",
+    ]
+    return "\n".join(lines)
+
+
+def row(agent: str, runs: list[evaluate.RunLog], task: Task, best: float) -> str:
+    """Return the agent's row: its score, that of each seed, the largest drop, and the minutes to 0.5 and 0.9 of `best`.
+
+    Drops and minutes are those of the curve on development levels. A drop is how far a seed's mean is below an earlier
+    one. If the task's score is not its metric, the mean of the metric stands behind the score.
+    """
+    scores = final_scores(task.score, runs)  # (R, M, E)
+    steps, curve = evaluate.align([run.curves[f"eval/{task.score}"] for run in runs])  # (P,), (P, R, M, E)
+    minutes = 60 * np.mean([run.hours(steps) for run in runs], 0)  # (P,)
+    means = curve.mean((-2, -1))  # (P, R)
+    drop = (np.maximum.accumulate(means) - means).max()
+    cells = [agent, mean_and_error(scores), f"{evaluate.iqm(scores):.2f}"]
+    cells.append(", ".join(f"{mean:.2f}" for mean in scores.mean((1, 2))))
+    if task.score != task.metric:
+        cells.append(f"{final_scores(task.metric, runs).mean():.2f}")
+    cells.append(f"{drop:.2f}")
+    for share in (0.5, 0.9):
+        there = np.flatnonzero(means.mean(1) >= share * best)
+        cells.append(f"{minutes[there[0]]:.1f}" if there.size and best else "")
+    return f"| {' | '.join(cells)} | {minutes[-1]:.1f} |"
+
+
+# ---- ALL TASKS ----
+def overview(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds]) -> str:
+    """Return a table with a row for each task: the mean score of each agent's final weights, and its standard error.
+
+    Beside it stand the scores of random actions and of the scripted player, the steps of a training, and the minutes of
+    the fastest and of the slowest agent. Where an agent has fewer seeds than others, it says how many; where it has
+    none, there is no number.
+    """
+    names = [*dict.fromkeys(agent for agents in tasks.values() for agent in agents)]
+    most = max(len(runs) for agents in tasks.values() for runs in agents.values())
+
+    def cell(task: Task, runs: list[evaluate.RunLog]) -> str:
+        if not runs:
+            return ""
+        few = f", {len(runs)} seed{'s' * (len(runs) > 1)}" if len(runs) < most else ""
+        return mean_and_error(final_scores(task.score, runs)) + few
+
+    header = ["task, score", "steps", "random", *names, "scripted", "minutes"]
+    lines = [f"| {' | '.join(header)} |", f"|---|{'---:|' * (len(header) - 1)}"]
+    for name, agents in tasks.items():
+        first = next(runs[0] for runs in agents.values() if runs)
+        minutes = [minutes_of(runs) for runs in agents.values() if runs]
+        known = bounds.get(name)
+        cells = [
+            f"{name}, {TASKS[name].score}",
+            f"{int(first.args['total_timesteps']) / 1e6:g} M",
+            f"{known.random:.2f}" if known else "",
+            *(cell(TASKS[name], agents.get(agent, [])) for agent in names),
+            f"{known.scripted:.2f}" if known else "",
+            f"{min(minutes):.0f} to {max(minutes):.0f}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def aggregate(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds]) -> str:
+    """Return a table over all tasks, a row an agent: its normalized IQM, and how probably it is better than `RIVALS`.
+
+    After Agarwal et al. (2021), "Deep Reinforcement Learning at the Edge of the Statistical Precipice". A seed's mean
+    is normalized so that 0 is that of random actions and 1 the best (`best_of`); the IQM is over all tasks and seeds.
+    The probability is that one seed is better than one of the rival's, averaged over tasks. Intervals, of 95 %, are
+    those of a bootstrap that draws seeds for each task by itself. Only tasks count that have bounds, and agents that
+    have the same number of seeds in all of them; "" if there are no two tasks or agents.
+    """
+    tasks = {name: agents for name, agents in tasks.items() if name in bounds}
+    counts = {len(runs) for agents in tasks.values() for runs in agents.values()}
+    names = [*dict.fromkeys(agent for agents in tasks.values() for agent in agents)]
+    if len(tasks) < 2 or len(names) < 2 or len(counts) != 1 or any([*agents] != names for agents in tasks.values()):
+        return ""
+    normalized = np.empty((len(names), len(tasks), *counts))  # (agents, T, R)
+    for i, (name, agents) in enumerate(tasks.items()):
+        low, high = bounds[name].random, best_of(TASKS[name], agents)
+        means = np.array([final_scores(TASKS[name].score, runs).mean((1, 2)) for runs in agents.values()])
+        normalized[:, i] = (means - low) / (high - low)
+    seeds = normalized.shape[-1]
+    rng = np.random.default_rng(0)
+    drawn = [rng.integers(seeds, size=(evaluate.RESAMPLES, len(tasks), seeds)) for _ in names]
+    resampled = np.stack(  # (agents, B, T, R)
+        [np.take_along_axis(scores[None], which, -1) for scores, which in zip(normalized, drawn, strict=True)]
+    )
+
+    def cell(value: np.ndarray, values: np.ndarray) -> str:
+        low, high = np.percentile(values, [2.5, 97.5])
+        return f"{float(value):.2f} ({low:.2f} to {high:.2f})"
+
+    rivals = [rival for rival in RIVALS if rival in names]
+    header = ["agent", "normalized IQM", *(f"better than {rival}" for rival in rivals)]
+    lines = [f"| {' | '.join(header)} |", f"|---|{'---:|' * (len(header) - 1)}"]
+    for name, scores, resamples in zip(names, normalized, resampled, strict=True):
+        cells = [cell(evaluate.iqm(scores[..., None]), evaluate.iqm(resamples[..., None]))]
+        for rival in rivals:
+            i = names.index(rival)
+            same = rival == name
+            cells.append("" if same else cell(better(scores, normalized[i]), better(resamples, resampled[i])))
+        lines.append(f"| {' | '.join([name, *cells])} |")
+    return "\n".join(lines)
+
+
+def better(scores: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return how probably a seed of scores (..., T, R) is above one of the others' (..., T, R), averaged over tasks."""
+    difference = scores[..., :, None] - others[..., None, :]  # (..., T, R, R)
+    return (0.5 + 0.5 * np.sign(difference)).mean((-3, -2, -1))
+
+
+# ---- PICTURE ----
+def draw(tasks: dict[str, evaluate.Runs], out: Path) -> None:
+    """Draw each task's curves on development levels, the mean and its standard error, with names at their ends.
+
+    An axis goes from 0 to the best possible score, or where there is no bound to a bit above the highest curve.
+    """
+    down = math.ceil(len(tasks) / 5)
+    across = math.ceil(len(tasks) / down)
+    figure = Figure(figsize=(4 * across, 3.2 * down), layout="constrained")
+    grid = figure.subplots(down, across, squeeze=False).ravel()
+    for axis in grid[len(tasks) :]:
+        axis.remove()
+    names = dict.fromkeys(agent for agents in tasks.values() for agent in agents)
+    others = itertools.cycle(color_sequences["Dark2"])
+    colors = {name: COLORS.get(name) or next(others) for name in names}
+    for axis, (name, agents) in zip(grid, tasks.items(), strict=False):
+        draw_task(axis, TASKS[name], {agent: runs for agent, runs in agents.items() if runs}, colors)
+        axis.set_title(name, fontsize="medium")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out, dpi=110)
+
+
+def draw_task(axis: Axes, task: Task, agents: evaluate.Runs, colors: dict[str, Any]) -> None:
+    """Draw the curves of one task's agents."""
+    ends, top = {}, 0.0
+    for agent, runs in agents.items():
+        x, scores = evaluate.align([run.curves[f"eval/{task.score}"] for run in runs])  # (P,), (P, R, M, E)
+        means = scores.mean((1, 2, 3))
+        errors = np.nan_to_num([evaluate.standard_error(each) for each in scores])
+        axis.plot(x, means, color=colors[agent], linewidth=1.5)
+        axis.fill_between(x, means - errors, means + errors, color=colors[agent], alpha=0.2, linewidth=0)
+        ends[agent], top = (x[-1], means[-1]), max(top, (means + errors).max())
+    top = task.best_score or top or 1.0
+    axis.set(xlabel="steps", ylabel=task.score, ylim=(0, top))
+    axis.xaxis.set_major_formatter(EngFormatter(sep=" "))
+    axis.grid(alpha=0.3)
+    axis.spines[["top", "right"]].set_visible(False)
+    places = spread([y / top for _, y in ends.values()], NAMES_APART)
+    for (agent, (x, _)), place in zip(ends.items(), places, strict=True):
+        where = {"xy": (x, place * top), "xytext": (4, 0), "textcoords": "offset points", "annotation_clip": False}
+        axis.annotate(textwrap.fill(agent, 20), **where, color=colors[agent], fontsize="small", va="center")
+
+
+def spread(places: list[float], apart: float) -> list[float]:
+    """Return places on an axis from 0 to 1, moved up or down so that neighbours are at least so far apart."""
+    order = np.argsort(places, kind="stable")
+    found = np.array(places, float)[order]
+    for i in range(1, len(found)):
+        found[i] = max(found[i], found[i - 1] + apart)
+    if found.size and found[-1] > 1:  # push down from the top
+        found[-1] = 1
+        for i in reversed(range(len(found) - 1)):
+            found[i] = min(found[i], found[i + 1] - apart)
+    return found[np.argsort(order)].tolist()

@@ -1,0 +1,182 @@
+"""benchmarks/tables.py: what is said of agents by what they reached."""
+
+import re
+import shlex
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tyro
+
+import evaluate
+import learning
+import tables
+from suites import COLORS, SUITES, TASKS, short
+
+ROOT = Path(__file__).parents[1]
+
+
+def run_with(*means, metric="eval/coins_collected"):
+    """Return a run that has these scores on all four levels, twice each, after 100, 200 and 300 steps."""
+    steps = np.array([100, 200, 300])
+    scores = np.broadcast_to(np.reshape(means, (3, 1, 1)), (3, 4, 2))
+    curves = {metric: (steps, scores), "charts/seconds_iteration": (steps, np.full((3, 1, 1), 60.0))}
+    return evaluate.RunLog("", {"total_timesteps": "300"}, curves, "a laptop")
+
+
+def test_a_row_of_the_table():
+    task, fallen = TASKS["Endless-SearingSpotlights-v0"], run_with(7, 3, 8)  # it fell from 7 to 3
+    row = tables.row("GRU", [run_with(2, 9, 10), fallen], task, best=6.0)
+    # The seeds' means, 10 and 8, have a standard error of 1; all levels are equal.
+    assert row == "| GRU | 9.00 ± 1.00 | 9.00 | 10.00, 8.00 | 4.00 | 1.0 | 2.0 | 3.0 |"
+    assert " | 4.00 | 2.0 |  | 3.0 |" in tables.row("GRU", [run_with(2, 9, 10), fallen], task, best=12.0)
+    assert "| 8.00 | 8.00 | 8.00 |" in tables.row("GRU", [fallen], task, best=12.0)
+    assert "| 0.00 |  |  | 3.0 |" in tables.row("GRU", [run_with(0, 0, 0)], task, best=0.0)
+
+
+def test_scores_are_those_on_test_levels_where_all_runs_have_them():
+    task, runs = TASKS["Endless-SearingSpotlights-v0"], [run_with(1, 2, 3), run_with(1, 2, 5)]
+    assert tables.final_scores(task.score, runs).mean() == 4
+    runs[0].curves["test/coins_collected"] = [300], np.full((1, 7, 1), 2.0)
+    assert tables.final_scores(task.score, runs).mean() == 4
+    runs[1].curves["test/coins_collected"] = [300], np.full((1, 7, 1), 1.0)
+    assert tables.final_scores(task.score, runs).shape == (2, 7, 1)
+    row = tables.row("GRU", runs, task, best=4.0)
+    assert row == "| GRU | 1.50 ± 0.50 | 1.50 | 2.00, 1.00 | 0.00 | 2.0 | 3.0 | 3.0 |"
+
+
+def test_agents_of_finite_mortar_mayhem_are_compared_by_what_they_carried_out():
+    """Both complete all four commands by the metric from the first evaluation on, and carry out some of them."""
+    task = TASKS["mortar-mayhem"]
+    slow, fast = (run_with(1, 1, 1, metric="eval/commands_completed") for _ in range(2))
+    for run, shares in ((slow, (0.25, 0.25, 0.75)), (fast, (0.25, 1, 1))):
+        run.curves["eval/carried_out"] = run_with(*shares).curves["eval/coins_collected"]
+    table = tables.table(task, {"slow": [slow], "fast": [fast]}).splitlines()
+    assert "| slow | 0.75 | 0.75 | 0.75 | 1.00 | 0.00 | 3.0 |  | 3.0 |" in table
+    assert "| fast | 1.00 | 1.00 | 1.00 | 1.00 | 0.00 | 2.0 | 2.0 | 3.0 |" in table
+
+
+def test_a_table_leaves_out_agents_without_runs_and_compares_with_the_best():
+    """Of success the best is 1, whoever reaches it; of coins it is the best agent's score."""
+    for name, minutes in (("Searing", "| 2.0 |  | 3.0 |"), ("Endless-Searing", "| 2.0 | 2.0 | 3.0 |")):
+        task = TASKS[f"{name}Spotlights-v0"]
+        ours, theirs = (run_with(0, 0.5, last, metric=f"eval/{task.metric}") for last in (0.5, 0.4))
+        table = tables.table(task, {"GRU": [ours], "LSTM": [], "TrXL": [theirs, theirs]})
+        head, *rows, note = [line for line in table.splitlines() if line]
+        assert head == f"{task.metric} after 300 steps"
+        assert [row.split(" | ")[0] for row in rows[2:]] == ["| GRU", "| TrXL"]
+        assert minutes in rows[2]
+        assert note == "Runs: 3, together 0.1 hours without evaluations. Machines: a laptop"
+
+
+def test_an_overview_says_where_seeds_or_agents_are_missing():
+    spotlights = run_with(0, 0, 0.25, metric="eval/success")
+    commands = run_with(0, 0, 2, metric="eval/commands_completed")
+    tasks = {
+        "SearingSpotlights-v0": {"GRU": [spotlights] * 3, "LSTM": [spotlights]},
+        "Endless-MortarMayhem-v0": {"GRU": [commands] * 2, "LSTM": []},
+    }
+    bounds = {"SearingSpotlights-v0": tables.Bounds(0.01, 0.9)}
+    assert tables.overview(tasks, bounds).splitlines() == [
+        "| task, score | steps | random | GRU | LSTM | scripted | minutes |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+        "| SearingSpotlights-v0, success | 0.0003 M | 0.01 | 0.25 ± 0.00 | 0.25, 1 seed | 0.90 | 3 to 3 |",
+        "| Endless-MortarMayhem-v0, commands_completed | 0.0003 M |  | 2.00 ± 0.00, 2 seeds |  |  | 3 to 3 |",
+    ]
+
+
+def two_tasks(gru, none):
+    """Return runs of two agents, their seeds' last scores in each of two tasks, and the tasks' bounds."""
+    names = ("SearingSpotlights-v0", "Endless-SearingSpotlights-v0")
+    runs = {
+        name: {
+            agent: [run_with(0, 0, score, metric=f"eval/{TASKS[name].metric}") for score in scores[i]]
+            for agent, scores in (("GRU", gru), ("no memory", none))
+        }
+        for i, name in enumerate(names)
+    }
+    return runs, {names[0]: tables.Bounds(0.2, 1.0), names[1]: tables.Bounds(1.0, 9.0)}
+
+
+def test_all_tasks_together():
+    """Success: 0.2 is random, 1 the best; coins: 1 is random, and the best are the 5 of the GRU."""
+    tasks, bounds = two_tasks(gru=((0.6, 0.6), (5, 5)), none=((0.2, 0.6), (1, 1)))
+    assert tables.aggregate(tasks, bounds).splitlines() == [
+        "| agent | normalized IQM | better than no memory | better than GRU |",
+        "|---|---:|---:|---:|",
+        "| GRU | 0.75 (0.75 to 0.75) | 0.88 (0.75 to 1.00) |  |",  # 0.5, 0.5, 1, 1; three of four pairs, all four
+        "| no memory | 0.00 (0.00 to 0.25) |  | 0.12 (0.00 to 0.25) |",  # 0, 0.5, 0, 0
+    ]
+
+
+@pytest.mark.parametrize("lacking", ["a seed", "bounds", "an agent"])
+def test_tasks_that_lack_something_are_not_taken_together(lacking):
+    tasks, bounds = two_tasks(gru=((0.6, 0.6), (5, 5)), none=((0.2, 0.6), (1, 1)))
+    if lacking == "bounds":
+        del bounds["SearingSpotlights-v0"]
+    elif lacking == "an agent":
+        del tasks["SearingSpotlights-v0"]["GRU"]
+    else:
+        tasks["SearingSpotlights-v0"]["GRU"].pop()
+    assert tables.aggregate(tasks, bounds) == ""
+
+
+def test_how_probably_a_seed_is_better():
+    ours = np.array([[1.0, 2.0], [0.0, 0.0]])  # in the first task 1 of 4 pairs is won and 1 is even, then all are lost
+    theirs = np.array([[2.0, 2.0], [1.0, 1.0]])
+    assert tables.better(ours, theirs) == pytest.approx(0.125)
+    assert tables.better(theirs, ours) == pytest.approx(0.875)
+
+
+@pytest.mark.parametrize("places", [[0.5], [0.0, 0.0, 0.01], [1.0, 0.99, 0.2, 1.2], [0.3, 0.1, 0.31, 0.1], []])
+def test_names_are_apart_and_in_order(places):
+    found = tables.spread(places, 0.1)
+    assert np.diff(np.sort(found)).min(initial=0.1) >= 0.1 - 1e-9
+    assert np.argsort(found, kind="stable").tolist() == np.argsort(places, kind="stable").tolist()
+    assert max(found, default=0) <= 1
+    assert tables.spread([0.1, 0.5, 0.9], 0.1) == [0.1, 0.5, 0.9], "nothing is in the way"
+
+
+def test_a_picture(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(tables.Figure, "savefig", lambda figure, *args, **flags: drawn.append(figure))
+    tasks, _ = two_tasks(gru=((0.6, 0.8), (5, 7)), none=((0.2, 0.6), (1, 1)))
+    tables.draw(tasks, tmp_path / "new/curves.png")
+    finite, endless = drawn[0].axes
+    assert (finite.get_ylim(), endless.get_ylim()) == ((0, 1), (0, 7)), "the best possible, and mean and error of 5, 7"
+    assert [text.get_text() for text in finite.texts] == ["GRU", "no memory"]
+    gru, none = finite.lines
+    assert (gru.get_color(), none.get_color()) == (COLORS["GRU"], COLORS["no memory"])
+    assert gru.get_ydata() == pytest.approx([0, 0, 0.7])
+
+
+def test_agents_of_the_suites_have_colors():
+    names = {name.partition(",")[0] for _, agents in SUITES.values() for name in map(short, agents)}
+    assert names == set(COLORS)
+
+
+def test_bounds_are_those_of_the_ten_tasks():
+    bounds = tables.read_bounds()
+    assert set(SUITES["full"][0]) <= set(bounds)
+    for name, each in bounds.items():
+        assert 0 <= each.random < each.scripted
+        if TASKS[name].best_score:
+            assert each.scripted <= TASKS[name].best_score
+
+
+def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_path, monkeypatch, capsys):
+    """All scores with a decimal point, and all tables as they are."""
+    monkeypatch.chdir(ROOT)
+    page = Path("docs/results.md").read_text()
+    fence = re.compile(r"^```\n(.*?)^```\n", re.MULTILINE | re.DOTALL)
+    for call in " ".join(fence.findall(page.replace("\\\n", " "))).split("python benchmarks/learning.py")[1:]:
+        config = tyro.cli(learning.Config, args=shlex.split(call))
+        learning.main(replace(config, report=True, out=tmp_path / "curves.png"))
+    printed = capsys.readouterr().out
+    text = fence.sub("", page)
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    assert len(lines) > 30
+    assert [line for line in lines if line not in printed.splitlines()] == []
+    numbers = set(re.findall(r"(?<![\d.])\d+\.\d+(?![\d.])", text.replace("section 6.3", "")))
+    assert numbers <= set(re.findall(r"\d+\.\d+", printed))
