@@ -3,27 +3,89 @@
 python benchmarks/options_page.py > docs/options.md
 """
 
+import json
+import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
-from memory_gym_envs import FAMILIES, options_table
+from memory_gym_envs import FAMILIES, Option
+from memory_gym_envs.options import LARGEST, LONGEST_LIST
+from memory_gym_envs.variant import Variant
 
-HEAD = """# Reset options
+HEAD = f"""# Reset options
 
-What `reset(options={...})` and `gym.make(id, options={...})` take, by environment. How long options hold is in
-[environments.md](environments.md#options). Of a list, marked *, one entry is sampled at every reset. Made by
-`python benchmarks/options_page.py`.
+`reset(options={{...}})` and `gym.make(id, options={{...}})` take these options.
+[How long they hold](environments.md#options). Columns with an id are its defaults: a dash where the id does not have
+the option, "ignored" where it takes the option without an effect, as the original does.
+
+Allowed values include both ends. `ints` is a list of 1 to {LONGEST_LIST} integers; one is sampled at every reset.
+Made by `python benchmarks/options_page.py`.
 """
+
+
+def number(value: float) -> str:
+    """Return a number as short as it can be written."""
+    return f"{'-' if value < 0 else ''}1e9" if abs(value) == LARGEST else f"{value:g}"
+
+
+def allowed(option: Option) -> str:
+    """Return the allowed values in a few characters."""
+    if option.kind == "bool":
+        return "bool"
+    text = f"{option.kind} " + "..".join(number(end) for end in option.bounds)
+    return " or ".join([*map(str, option.also), text]) + (", or empty" if option.empty else "")
+
+
+def allowed_in(rows: Mapping[str, Option]) -> str:
+    """Return the allowed values of an option, by id; where they differ, those of the first id come first."""
+    ids: dict[str, list[str]] = {}
+    for id_, option in rows.items():
+        ids.setdefault(allowed(option), []).append(id_)
+    first, *others = ids
+    return "; ".join([first, *(f"{other} in {', '.join(ids[other])}" for other in others)])
+
+
+def default(option: Option | None) -> str:
+    """Return the cell of an id that has the option, or has not."""
+    if option is None:
+        return "-"
+    return "ignored" if option.ignored else f"`{json.dumps(option.default)}`"
+
+
+def names_in_order(variants: Mapping[str, Variant]) -> list[str]:
+    """Return the names of all options. What only a later id has stands before the next option that it shares."""
+    names: list[str] = []
+    for variant in variants.values():
+        at = len(names)
+        for option in reversed(variant.options):
+            if option.name in names:
+                at = names.index(option.name)
+            else:
+                names.insert(at, option.name)
+    return names
+
+
+def table(variants: Mapping[str, Variant]) -> str:
+    """Return a family's table. Raises ValueError if an option does not mean the same in all ids."""
+    lines = [f"| option | meaning | allowed | {' | '.join(variants)} |", "|---" * (3 + len(variants)) + "|"]
+    for name in names_in_order(variants):
+        rows = {id_: option for id_, variant in variants.items() for option in variant.options if option.name == name}
+        meaning, *others = {option.meaning for option in rows.values()}
+        if others:
+            raise ValueError(f"{name} means {meaning!r} in one id, and {others} in others")
+        defaults = " | ".join(default(rows.get(id_)) for id_ in variants)
+        lines.append(f"| `{name}` | {meaning} | {allowed_in(rows)} | {defaults} |")
+    return "\n".join(lines)
 
 
 def page() -> str:
     """Return the page as Markdown."""
-    tables = [
-        f"## {id_}\n\n{options_table(row.options)}" for family in FAMILIES for id_, row in family.variants.items()
-    ]
-    return "\n".join([HEAD, "\n\n".join(tables)]) + "\n"
+    titles = [re.sub("(?<=[a-z])(?=[A-Z])", " ", family.__name__) for family in FAMILIES]
+    tables = [f"## {name}\n\n{table(family.variants)}\n" for name, family in zip(titles, FAMILIES, strict=True)]
+    return "\n".join([HEAD, *tables])
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from gymnasium.envs.registration import register
 from memory_gym_envs.base import MemoryGymVectorEnv
 from memory_gym_envs.mortar_mayhem import MortarMayhem
 from memory_gym_envs.mystery_path import MysteryPath
-from memory_gym_envs.options import Option, options_table
+from memory_gym_envs.options import Option
 from memory_gym_envs.searing_spotlights import SearingSpotlights
 from memory_gym_envs.single import MemoryGymEnv
 
@@ -22,7 +22,6 @@ __all__ = [
     "MysteryPath",
     "Option",
     "SearingSpotlights",
-    "options_table",
 ]
 
 FAMILIES = (MortarMayhem, MysteryPath, SearingSpotlights)

@@ -3,11 +3,9 @@
 A family lists its options as a tuple of `Option`. `complete_options` turns what a caller passed to `reset` into a
 complete dictionary of plain Python values, or raises one `ValueError` that says which option is wrong and what would be
 right.
-`options_table` prints the same rows as Markdown.
 """
 
 import difflib
-import json
 import numbers
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,6 +25,7 @@ class Option:
     low, high: the allowed range, both ends included; None: as far as LARGEST on that side.
     also: single values allowed besides the range.
     empty: whether a list may have no entries.
+    ignored: accepted without an effect, as in the original.
     """
 
     name: str
@@ -37,6 +36,7 @@ class Option:
     meaning: str
     also: tuple[int, ...] = ()
     empty: bool = False
+    ignored: bool = False
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -114,10 +114,3 @@ def brief(value: Any) -> str:
     except ValueError:  # Python writes out no integer of more than 4300 digits
         text = "a number too large to be written out"
     return text if len(text) <= 80 else f"{text[:77]}..."
-
-
-def options_table(options: tuple[Option, ...]) -> str:
-    """The options as a Markdown table: name, default, allowed values, meaning."""
-    rows = ["| option | default | allowed | meaning |", "|---|---|---|---|"]
-    rows += [f"| `{o.name}` | `{json.dumps(o.default)}` | {o.allowed} | {o.meaning} |" for o in options]
-    return "\n".join(rows)

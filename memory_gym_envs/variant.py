@@ -31,9 +31,9 @@ def max_steps(default: int) -> Option:
     return Option("max_steps", default, "int", 1, None, "steps until truncation; -1: no limit", also=(-1,))
 
 
-def agent_scale(note: str = "") -> Option:
+def agent_scale(ignored: bool = False) -> Option:
     """The option that sets the agent's size."""
-    return Option("agent_scale", 0.25, "float", 0.04, 1.0, f"size of the agent; 0.25: 12 pixels wide{note}")
+    return Option("agent_scale", 0.25, "float", 0.04, 1.0, "size of the agent; 0.25: 12 pixels wide", ignored=ignored)
 
 
 def agent_speed() -> Option:

@@ -1,5 +1,6 @@
 """The pages that programs make are what the programs make today."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+
+from memory_gym_envs import FAMILIES
 
 ROOT = Path(__file__).parents[1]
 
@@ -16,6 +19,15 @@ def test_page(name):
     program = ROOT / f"benchmarks/{name}_page.py"
     made = subprocess.run([sys.executable, program], capture_output=True, text=True, check=True)
     assert made.stdout == (ROOT / f"docs/{name}.md").read_text()
+
+
+@pytest.mark.parametrize(("env_id", "variant"), [row for family in FAMILIES for row in family.variants.items()])
+def test_page_has_every_default(env_id, variant):
+    section = next(part for part in (ROOT / "docs/options.md").read_text().split("\n## ") if f"| {env_id} |" in part)
+    header, _, *rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
+    shown = {row[0].strip("`"): row[header.index(env_id)].strip("`") for row in rows}
+    shown = {name: text for name, text in shown.items() if text != "-"}
+    assert shown == {o.name: "ignored" if o.ignored else json.dumps(o.default) for o in variant.options}
 
 
 def test_pictures(tmp_path):

@@ -32,20 +32,23 @@ def option_rows(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
     most = 100 if clue else VECTOR_COMMANDS
     rows = [
         (endless, max_steps(-1)),
-        (True, agent_scale("; ignored, as in the original" if grid else "")),
+        (True, agent_scale(ignored=grid)),
         (not grid, agent_speed()),
         (not endless, Option("arena_size", 5, "int", smallest, largest, "tiles along one side of the arena")),
         (True, Option("allowed_commands", 5 if grid else 9, "int", 4, 9, "how many kinds of command may occur")),
-        (not endless, Option("command_count", (10,), "ints", 1, most, "commands to do *")),
+        (not endless, Option("command_count", (10,), "ints", 1, most, "commands to do")),
         (endless, Option("initial_command_count", 1, "int", 1, 100, "commands in the first sequence")),
-        (clue, Option("command_show_duration", (3,), "ints", 1, 100, "steps that a command is shown *")),
-        (clue, Option("command_show_delay", (1,), "ints", 0, 100, "blank steps after a shown command *")),
-        (True, Option("explosion_duration", duration, "ints", 1, 1000, "steps that the tiles burn *")),
-        (True, Option("explosion_delay", delay, "ints", 1, 1000, "steps to carry out a command in *")),
+        (clue, Option("command_show_duration", (3,), "ints", 1, 100, "steps that a command is shown")),
+        (clue, Option("command_show_delay", (1,), "ints", 0, 100, "blank steps after a shown command")),
+        (True, Option("explosion_duration", duration, "ints", 1, 1000, "steps that the tiles burn")),
+        (True, Option("explosion_delay", delay, "ints", 1, 1000, "steps to carry out a command in")),
         (True, Option("visual_feedback", True, "bool", None, None, "show burning tiles in red")),
         (True, Option("reward_command_failure", 0.0, "float", None, None, "reward for standing on a burning tile")),
         (True, Option("reward_command_success", 0.1, "float", None, None, "reward for each command carried out")),
-        (not endless, Option("reward_episode_success", 0.0, "float", None, None, "added with the last command's")),
+        (
+            not endless,
+            Option("reward_episode_success", 0.0, "float", None, None, "reward added with the last command's"),
+        ),
     ]
     return present(rows)
 

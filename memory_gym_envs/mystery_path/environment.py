@@ -118,7 +118,7 @@ class MysteryPath(MemoryGymVectorEnv):
     | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
 
     `reset(options={...})` takes the same reset parameters, a single environment for one episode. `docs/options.md` and
-    `VARIANTS[id].options` list them. Those marked * are lists, one entry of which is sampled at every reset.
+    `VARIANTS[id].options` list them. Of a list, one entry is sampled at every reset.
 
     ## Version History
 

@@ -23,16 +23,15 @@ SHOWN = {  # by the options that show something: the state has a field show_... 
 def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
     """The reset options of an id, in the original's order."""
     steps, progress = -1 if endless else 128 if grid else 512, 0.0 if grid else 0.1
-    ignored = "ignored, as in the original"
-    origin = ignored if endless else "show the path's origin in blue"
+    origin = "show the path's origin in blue"
     sides = "where the path starts: 0 left, 1 right, 2 top, 3 bottom"
     camera = "how many tiles from the screen's left edge the agent is drawn"
     rows = [
         (True, max_steps(steps)),
-        (True, agent_scale(f"; {ignored}" if grid else "")),
+        (True, agent_scale(ignored=grid)),
         (not grid, agent_speed()),
-        (not endless, Option("cardinal_origin_choice", (0, 1, 2, 3), "ints", 0, 3, f"{sides} *")),
-        (True, Option("show_origin", False, "bool", None, None, origin)),
+        (not endless, Option("cardinal_origin_choice", (0, 1, 2, 3), "ints", 0, 3, sides)),
+        (True, Option("show_origin", False, "bool", None, None, origin, ignored=endless)),
         (not endless, Option("show_goal", False, "bool", None, None, "show the path's goal in green")),
         (endless, Option("show_past_path", True, "bool", None, None, "show the path behind the agent in white")),
         (endless, Option("show_background", False, "bool", None, None, "show tiles that move as the agent walks")),

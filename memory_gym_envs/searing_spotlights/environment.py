@@ -101,8 +101,8 @@ class SearingSpotlights(MemoryGymVectorEnv):
     | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
 
     `reset(options={...})` takes the same reset parameters, in a single environment for one episode. `docs/options.md`
-    and `VARIANTS[id].options` list them. Those marked * are lists, one entry of which is sampled at every reset, or
-    for each interval. Radii and speeds of spotlights are sampled between their smallest and largest.
+    and `VARIANTS[id].options` list them. Of a list, one entry is sampled at every reset, or for each interval. Radii
+    and speeds of spotlights are sampled between their smallest and largest.
 
     ## Version History
 

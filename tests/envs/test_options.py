@@ -1,6 +1,5 @@
 """Reset options: how long they hold, and what is a wrong one."""
 
-import json
 import pickle
 
 import gymnasium as gym
@@ -9,7 +8,7 @@ import pytest
 from helpers import EACH, HASTY, LANES, check_same, make, roll
 from players import FAMILY
 
-from memory_gym_envs import IDS, MortarMayhem, MysteryPath, SearingSpotlights, options_table
+from memory_gym_envs import IDS, MortarMayhem, MysteryPath, SearingSpotlights
 
 
 @EACH
@@ -186,8 +185,6 @@ def test_values_may_be_numpys(env_id):
 
 
 @EACH
-def test_options_table(env_id):
-    table = options_table(FAMILY[env_id].variants[env_id].options)
+def test_defaults_are_allowed(env_id):
     for option in FAMILY[env_id].variants[env_id].options:
-        assert f"| `{option.name}` | `{json.dumps(option.default)}` | {option.allowed} |" in table
         assert option.parse(option.default) == option.default
