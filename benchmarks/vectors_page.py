@@ -3,43 +3,71 @@
 python benchmarks/vectors_page.py > docs/vectors.md
 """
 
+import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
 from memory_gym_envs import FAMILIES
-from memory_gym_envs.entries import vector_table
+from memory_gym_envs.entries import Entries, vector_slices
+from memory_gym_envs.variant import Variant
 
 HEAD = """# Vector observations
 
 `gym.make(id, obs_type="vector")`, and `gym.make_vec` likewise, return a flat float32 vector in place of the frame, and
-draw none. It holds what the frame shows and nothing that it hides: two states with the same frame have the same vector,
-under the same options. What is not in sight is zero. Pixels count from the left and from the top of the screen of
-84 x 84. Made by `python benchmarks/vectors_page.py`.
+draw none. It holds what the frame shows and nothing that it hides: under the same options, two states with the same
+frame have the same vector. What is not in sight is 0.
 
-What hides an agent, or a part of it, hides its entries. Behind the screen's edge, a symbol or a cross, several facings
-may look the same: then all of them are 1, where usually one is. In a corner of the torus of Endless Mortar Mayhem, even
-several places may. Agents so large that they hide whole tiles hide their entries, too. Sizes that only options change
-are there as well, so that they mean the same under all options.
+A column with ids says where the entries are in their vector, counted from 0; its length is in brackets. Entries are
+from 0 to 1, unless a range stands beside them. Pixels count from the left and from the top of the 84 x 84 screen, x
+before y. The order of facings is up, up-left, left, and so on to up-right.
 
-In Searing Spotlights, what is seen below the bar is counted from every third pixel, so that a few visible pixels may
-count as none.
+- Where something hides a part of the agent, several facings or places may look the same. All these facings are then 1,
+  and the place is the middle of these places.
+- Agents so large that they hide whole tiles hide their entries, too.
+- `size` and `arena`, where visible, change with options only.
+- In Searing Spotlights, what is seen below the bar is counted from every third pixel: a few visible pixels may count as
+  none.
+
+Made by `python benchmarks/vectors_page.py`.
 """
 
 
+def cell(row: Entries | None, at: slice) -> str:
+    """Return where the entries are, with their range where it is not 0 to 1; a dash if the id has none."""
+    if row is None:
+        return "-"
+    place = f"{at.start}" if row.width == 1 else f"{at.start}-{at.stop - 1}"
+    return place if (row.low, row.high) == (0, 1) else f"{place} ({row.low:g} to {row.high:g})"
+
+
+def table(variants: Mapping[str, Variant]) -> str:
+    """Return a family's table, a column for all ids with the same entries.
+
+    Raises ValueError if entries do not mean the same in all ids.
+    """
+    ids: dict[tuple[Entries, ...], list[str]] = {}
+    meanings: dict[str, str] = {}
+    for id_, variant in variants.items():
+        ids.setdefault(variant.entries, []).append(id_)
+        for row in variant.entries:
+            if meanings.setdefault(row.name, row.meaning) != row.meaning:
+                raise ValueError(f"{row.name} of {id_} means something else in the ids before")
+    heads = [f"{', '.join(same)} ({sum(row.width for row in rows)})" for rows, same in ids.items()]
+    lines = [f"| name | meaning | {' | '.join(heads)} |", "|---" * (2 + len(ids)) + "|"]
+    for name, meaning in meanings.items():
+        cells = [cell({row.name: row for row in rows}.get(name), vector_slices(rows).get(name)) for rows in ids]
+        lines.append(f"| `{name}` | {meaning} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def page() -> str:
-    """Return the page as Markdown, a section for all ids with the same entries."""
-    ids: dict[tuple, list[str]] = {}
-    for family in FAMILIES:
-        for id_, variant in family.variants.items():
-            ids.setdefault(variant.entries, []).append(id_)
-    tables = [
-        f"## {', '.join(same)}\n\n{sum(row.width for row in rows)} entries.\n\n{vector_table(rows)}"
-        for rows, same in ids.items()
-        if rows
-    ]
-    return "\n".join([HEAD, "\n\n".join(tables)]) + "\n"
+    """Return the page as Markdown."""
+    titles = [re.sub("(?<=[a-z])(?=[A-Z])", " ", family.__name__) for family in FAMILIES]
+    tables = [f"## {name}\n\n{table(family.variants)}\n" for name, family in zip(titles, FAMILIES, strict=True)]
+    return "\n".join([HEAD, *tables])
 
 
 if __name__ == "__main__":

@@ -35,12 +35,3 @@ def vector_slices(rows: tuple[Entries, ...]) -> dict[str, slice]:
     """Where each row's entries are in the vector."""
     ends = np.cumsum([row.width for row in rows]).tolist()
     return {row.name: slice(end - row.width, end) for row, end in zip(rows, ends, strict=True)}
-
-
-def vector_table(rows: tuple[Entries, ...]) -> str:
-    """The rows as a Markdown table: place, name, range, meaning."""
-    lines = ["| entries | name | range | meaning |", "|---|---|---|---|"]
-    for row, at in zip(rows, vector_slices(rows).values(), strict=True):
-        place = f"{at.start}" if row.width == 1 else f"{at.start}-{at.stop - 1}"
-        lines.append(f"| {place} | `{row.name}` | {row.low:g} to {row.high:g} | {row.meaning} |")
-    return "\n".join(lines)

@@ -61,7 +61,7 @@ def entry_rows(clue: bool, endless: bool) -> tuple[Entries, ...]:
     return (
         *agent_entries(-around, SCREEN + around),
         Entries("arena", 1, f"tiles along one side of the arena, / {ARENA_SIZES[-1]}; 0: an agent hides all of it"),
-        Entries("fire", 1, "1: tiles burn, and it shows"),
+        Entries("fire", 1, "1: tiles burn, and it is visible"),
         Entries("safe", 2, "the centre of the tile that does not burn, x and y, / 84 pixels; zeros: none, or hidden"),
         Entries("command", len(COMMANDS), command) if clue else Entries("commands", VECTOR_COMMANDS * 9, rest),
     )

@@ -49,7 +49,7 @@ def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
 
 def _entries(endless: bool) -> tuple[Entries, ...]:
     """The entries of an id's vector observation."""
-    cross = Entries("cross", 1, "1: a red cross is seen, where the agent fell off")
+    cross = Entries("cross", 1, "1: a red cross is visible, where the agent fell off")
     if not endless:
         places = [
             Entries(name, 2, f"the centre of the path's {name}, x and y, / 84 pixels; zeros: not shown, or hidden")
@@ -57,17 +57,19 @@ def _entries(endless: bool) -> tuple[Entries, ...]:
         ]
         return *agent_entries(0, SCREEN + LARGEST_RADIUS), cross, *places
     past = (
-        "1: a tile of the path behind the agent shows, by column and then row; its left edge is in one of 8 columns of "
-        "12 pixels, the first of which is left of the screen"
+        "1: a tile of the path behind the agent is visible; by column and then row: 7 rows, and 8 columns of 12 pixels "
+        "for the tile's left edge, the first of them left of the screen"
     )
     return (
         *agent_entries(-PAD, SPAN - 1 - PAD),
         cross,
         Entries("past", SEGMENT * SIDE, past),
-        Entries("scroll", 1, "how far right of its column's left edge each of them starts, at most, / 12 pixels"),
-        Entries("ground", 1, "one more than how far left the background has moved, / 12 pixels; 0: there is none"),
-        Entries("bar", 1, "1: the stamina bar is there"),
-        Entries("stamina", 1, "how much of it is green"),
+        Entries(
+            "scroll", 1, "how far right of its column's left edge each of these tiles starts, at most, / 12 pixels"
+        ),
+        Entries("ground", 1, "one more than how far left the background has moved, / 12 pixels; 0: no background"),
+        Entries("bar", 1, "1: the stamina bar is visible"),
+        Entries("stamina", 1, "share of the stamina bar that is green"),
     )
 
 

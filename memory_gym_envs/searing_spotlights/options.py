@@ -72,9 +72,9 @@ def body_rows(endless: bool) -> list[tuple[bool, Option]]:
 
 def entry_rows(endless: bool) -> tuple[Entries, ...]:
     """The entries of an id's vector."""
-    action = "the action in the bar, one-hot: none, {}, {}; zeros where it is hidden"
-    place = "{}: how many pixels are visible, over 144 and at most 1; x and y of their middle, over 84"
-    tiles = "of each tile of 12 x 12 pixels, row by row, the share that is {}; the bar's pixels don't count"
+    action = "the action in the bar, one-hot: none, {}, {}; zeros: hidden"
+    place = "{}: visible pixels / 144, at most 1; x and y of their middle, / 84"
+    tiles = "of each tile of 12 x 12 pixels, row by row, the share that is {}, without the bar's pixels"
     table: list[tuple[Any, ...]] = [
         (True, "health", 1, "share of the bar's left half that is green"),
         (True, "horizontal", 3, action.format("left", "right")),
@@ -83,7 +83,7 @@ def entry_rows(endless: bool) -> tuple[Entries, ...]:
         (True, "agent", 3, place.format("the agent")),
         (not endless, "exit", 3, place.format("the exit without its black frame")),
         (True, "coin", 3, place.format("the coin, or all of them")),
-        (True, "facing", 8, "the agent's where all of it is visible, one-hot: up, up-left, left, ... up-right"),
+        (True, "facing", 8, "the agent's facing where all of it is visible, one-hot"),
         (not endless, "exit_open", 1, "1 where an open exit is visible"),
         (not endless, "coins", 49, tiles.format("coins")),
         (True, "light", 49, tiles.format("bright floor or, with a black background, rims of spotlights")),
