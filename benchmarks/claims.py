@@ -3,10 +3,7 @@
     python benchmarks/claims.py --results benchmarks/results
     python benchmarks/claims.py --claims query-position gate-bias
 
-The thesis trained for up to 819 million steps from pixels. Here networks are small, observations are vectors, and a
-training takes minutes, up to an hour in the longer ones, as in benchmarks/learning.py, whose tasks, runs and results
-these are; so a verdict is about these tasks. In the small Mystery Path, transformers have no positional encoding, as
-there.
+Tasks, runs and results are those of benchmarks/learning.py: small networks, vector observations, minutes of training.
 
 A claim compares pairs of agents: each that is said to have the higher number with each that is said to have the lower
 one. A pair is decided if the means differ by at least two standard errors of their difference, over seeds and levels.
@@ -24,6 +21,7 @@ With --report nothing is trained, and a claim is not tested if runs are missing.
 
 import itertools
 import math
+import re
 import signal
 import sys
 from collections import Counter
@@ -39,43 +37,25 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other pac
 
 import evaluate
 import learning
-import suites
-import tables
-from suites import TASKS, Task
+from learning import Task
 
-MORTAR_MAYHEM, MYSTERY_PATH = TASKS["mortar-mayhem"], TASKS["mystery-path"]
-FULL_MORTAR_MAYHEM, FREE_MORTAR_MAYHEM = TASKS["MortarMayhem-Grid-v0"], TASKS["MortarMayhem-v0"]
-FULL_MYSTERY_PATH, FULL_SPOTLIGHTS = TASKS["MysteryPath-v0"], TASKS["SearingSpotlights-v0"]
-FULL_MYSTERY_PATH_GRID = TASKS["MysteryPath-Grid-v0"]
-ENDLESS = TASKS["endless-mortar-mayhem"]
-LONG_ENDLESS = replace(ENDLESS, total_timesteps=12_000_000)
-FULL_ENDLESS = TASKS["Endless-MortarMayhem-v0"]
-ENDLESS_MYSTERY_PATH, ENDLESS_SPOTLIGHTS = TASKS["Endless-MysteryPath-v0"], TASKS["Endless-SearingSpotlights-v0"]
-COMMANDS_IN_VIEW = replace(
-    MORTAR_MAYHEM,
-    env_id="MortarMayhemB-Grid-v0",
-    options={"command_count": [4], "explosion_delay": [4], "explosion_duration": [2]},
-)
-GOAL_IN_VIEW = replace(MYSTERY_PATH, options=MYSTERY_PATH.options | {"show_origin": True, "show_goal": True})
-ALL_IN_VIEW = Task(
-    "SearingSpotlights-v0", 1_000_000, dict.fromkeys(("agent_visible", "coins_visible", "exit_visible"), True)
-)
+IN_VIEW = {"command_count": [4], "explosion_delay": [4], "explosion_duration": [2]}
+ALL_VISIBLE = {"agent_visible": True, "coins_visible": True, "exit_visible": True}
+PATH, ENDLESS = learning.SMALL["mystery-path"], learning.SMALL["endless-mortar-mayhem"]
+TASKS = learning.TASKS | {
+    "commands-in-view": replace(learning.SMALL["mortar-mayhem"], env_id="MortarMayhemB-Grid-v0", options=IN_VIEW),
+    "goal-in-view": replace(PATH, options=PATH.options | {"show_origin": True, "show_goal": True}),
+    "all-in-view": Task("SearingSpotlights-v0", 1_000_000, ALL_VISIBLE),
+    "endless-long": replace(ENDLESS, total_timesteps=12_000_000),
+}
+WIDE_TASKS = {*learning.FULL, "endless-long"}  # here, transformers have about as many parameters as the GRU
 DECIDED = 2.0  # standard errors of a difference
-FEW_FRAMES = ("no memory", "stack of 4", "step encoding")
-# With about as many parameters as the GRU: the thesis' transformer and GTrXL, and one whose queries know their step.
-WIDE_TRXL, WIDE_GTRXL = f"TrXL {suites.WIDE}", f"GTrXL {suites.WIDE}"
-WIDE_QUERY_POSITION = f"TrXL --trxl-query-position {suites.WIDE}"
-# The thesis' learning rate is at its final value after a fifth of the training: of the steps of ENDLESS, unless
-# --steps-scale changes them.
-TO_1E_4, TO_1E_5 = "TrXL --anneal-steps 200000", "TrXL --anneal-steps 200000 --final-lr 1e-5"
-# Large steps are what the thesis suspects, and --target-kl would prevent them.
-NOT_NORMALIZED, NORMALIZED = "GRU --target-kl None", "GRU --target-kl None --norm-adv minibatch"
 
 
 # What is compared, (R, M): of each seed, on each level.
 def score(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
     """Return the scores of the final weights."""
-    return tables.final_scores(task.score, runs).mean(-1)
+    return learning.final_scores(task.score, runs).mean(-1)
 
 
 def area(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
@@ -85,7 +65,7 @@ def area(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
 
 def falls(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
     """Return how often the final weights fall off."""
-    return tables.final_scores("num_fails", runs).mean(-1)
+    return learning.final_scores("num_fails", runs).mean(-1)
 
 
 def gradient_norm(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
@@ -100,210 +80,156 @@ class Claim:
     Or, if `expects_difference` is false, that it does not.
     """
 
-    section: str
-    text: str
-    task: Task
+    task: str
     higher: tuple[str, ...]
     lower: tuple[str, ...]
     measure: Callable[[Task, list[evaluate.RunLog]], np.ndarray] = score
+    text: str = ""  # where neither the claim's name nor its table's title says it
+    flags: str = ""  # of all agents
     expects_difference: bool = True
 
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Return all that are compared."""
+        return (*self.higher, *self.lower)
 
-CLAIMS = {
-    "memory-mortar-mayhem": Claim(
-        "6.2.1", "only agents with a memory solve Mortar Mayhem Grid", MORTAR_MAYHEM,
-        ("GRU", "TrXL"), (*FEW_FRAMES, "stack of 16"),
+    def plans(self, config: learning.Training, agent: str) -> list[learning.Plan]:
+        """Return the trainings of one of the agents, one for each seed."""
+        name, *own = agent.split(" --", 1)
+        wide = [learning.WIDE] if self.task in WIDE_TASKS and "TrXL" in name else []
+        trained = " ".join([name, *self.flags.split(), *(f"--{flags}" for flags in own), *wide])
+        return [learning.plan(config, TASKS[self.task], trained, seed) for seed in config.seeds]
+
+    def numbers(self, runs: list[evaluate.RunLog]) -> np.ndarray:
+        """Return what is compared, (R, M)."""
+        return self.measure(TASKS[self.task], runs)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Claims that compare the same agents."""
+
+    title: str
+    columns: tuple[str, ...]  # agents; others go to a last column of variants
+    claims: dict[str, Claim]
+
+    @property
+    def has_variants(self) -> bool:
+        """Return whether claims compare agents without a column of their own."""
+        return any(agent not in self.columns for claim in self.claims.values() for agent in claim.agents)
+
+
+def claims_of(prefix: str, tasks: str, higher: tuple[str, ...], lower: tuple[str, ...], **others) -> dict[str, Claim]:
+    """Return the same claim about each of some tasks; a name is the prefix and the task's name."""
+    return {f"{prefix}-{task}": Claim(task, higher, lower, **others) for task in tasks.split()}
+
+
+def in_endless(higher: tuple[str, ...], lower: tuple[str, ...], **others) -> Claim:
+    """Return a claim about the small Endless Mortar Mayhem."""
+    return Claim("endless-mortar-mayhem", higher, lower, **others)
+
+
+MEMORY, FEW_FRAMES = ("GRU", "TrXL"), ("no memory", "stack of 4", "step encoding")
+NO_MEMORY = (*FEW_FRAMES, "stack of 16")
+GRU, TRXL, LSTM, GTRXL = ("GRU",), ("TrXL",), ("LSTM",), ("GTrXL",)
+QUERY_POSITION, NORMALIZED = "TrXL --trxl-query-position", "GRU --norm-adv minibatch"
+MORTAR_MAYHEMS = "mortar-mayhem MortarMayhem-Grid-v0 MortarMayhem-v0"
+TABLES = (
+    Table(
+        "Agents with a memory are ahead of all others (6.2.1)",
+        ("no memory", "stack of 4", "stack of 16", "step encoding", "GRU", "TrXL"),
+        {
+            **claims_of("memory", f"{MORTAR_MAYHEMS} mystery-path MysteryPath-Grid-v0", MEMORY, NO_MEMORY),
+            **claims_of("memory", "MysteryPath-v0 SearingSpotlights-v0 commands-in-view", MEMORY, NO_MEMORY),
+            **claims_of("frames", "commands-in-view", ("step encoding", "stack of 4", "stack of 16"), ("no memory",)),
+            **claims_of("stack", "goal-in-view", ("stack of 16", *MEMORY), FEW_FRAMES),
+        },
     ),
-    "memory-full-mortar-mayhem": Claim(
-        "6.2.1", "agents with a memory complete more commands than all others in the full Mortar Mayhem Grid",
-        FULL_MORTAR_MAYHEM,
-        ("GRU", WIDE_TRXL), (*FEW_FRAMES, "stack of 16"),
+    Table(
+        "GRU and TrXL: samples (6.2.2), endless tasks (6.3), falls (6.5.2)",
+        ("GRU", "TrXL"),
+        {
+            **claims_of("samples", "mortar-mayhem MortarMayhem-Grid-v0", TRXL, GRU, measure=area),
+            "samples-small-values": Claim(
+                "mortar-mayhem", TRXL, GRU, area, "(`--value-init-gain 0.01`)", "--value-init-gain 0.01"
+            ),
+            **claims_of("score", "MortarMayhem-v0", TRXL, GRU),
+            **claims_of("samples", "mystery-path MysteryPath-v0", TRXL, GRU, measure=area),
+            **claims_of("samples", "SearingSpotlights-v0 commands-in-view goal-in-view", GRU, TRXL, measure=area),
+            **claims_of("score", "endless-mortar-mayhem Endless-MortarMayhem-v0", GRU, TRXL),
+            **claims_of("score", "Endless-MysteryPath-v0 Endless-SearingSpotlights-v0", GRU, TRXL),
+            **claims_of("falls", "mystery-path MysteryPath-v0", GRU, TRXL, measure=falls),
+        },
     ),
-    "memory-free-mortar-mayhem": Claim(
-        "6.2.1", "the same in the full Mortar Mayhem with free movement", FREE_MORTAR_MAYHEM,
-        ("GRU", WIDE_TRXL), (*FEW_FRAMES, "stack of 16"),
+    Table(
+        "LSTM is behind GRU (6.2.3)",
+        ("GRU", "LSTM"),
+        {
+            **claims_of("lstm-score", MORTAR_MAYHEMS, GRU, LSTM),
+            **claims_of("lstm-samples", "mystery-path MysteryPath-v0 SearingSpotlights-v0", GRU, LSTM, measure=area),
+        },
     ),
-    "memory-commands-in-view": Claim(
-        "6.2.1", "with all commands in view, knowing the time or some frames helps", COMMANDS_IN_VIEW,
-        ("step encoding", "stack of 4", "stack of 16"), ("no memory",),
+    Table(
+        "GTrXL is behind TrXL (6.2.3)",
+        ("TrXL", "GTrXL"),
+        {
+            **claims_of("gates-score", MORTAR_MAYHEMS, TRXL, GTRXL),
+            **claims_of("gates-samples", "mystery-path MysteryPath-v0 SearingSpotlights-v0", TRXL, GTRXL, measure=area),
+        },
     ),
-    "memory-best-in-view": Claim(
-        "6.2.1", "even with all commands in view, agents with a memory are best", COMMANDS_IN_VIEW,
-        ("GRU", "TrXL"), (*FEW_FRAMES, "stack of 16"),
+    Table(
+        "Variants of the transformers, in the small Endless Mortar Mayhem",
+        ("GRU", "TrXL"),
+        {
+            "gate-bias": Claim(
+                "mystery-path", GTRXL, ("GTrXL --trxl-gate-bias 2",), text="(6.2.3) in Mystery Path, 0 is better than 2"
+            ),
+            "endless-long": Claim("endless-long", GRU, (QUERY_POSITION,), text="(6.3, 7.1.3) 12 million steps"),
+            "capacity": in_endless(
+                GRU,
+                ("TrXL --trxl-dim 96", "TrXL --trxl-num-layers 3", "TrXL --trxl-memory-length 256"),
+                text="(7.1.1) still behind GRU",
+            ),
+            "ground-truth": in_endless(("TrXL --ground-truth-coef 0.1",), TRXL, text="(7.1.2) estimating it helps"),
+            # The thesis' rate is at its final value after a fifth of the training.
+            "learning-rate": in_endless(
+                TRXL,
+                ("TrXL --final-lr 1e-5",),
+                text="(7.1.2) a higher final one helps",
+                flags="--anneal-steps 200000",
+            ),
+            "query-position": in_endless((QUERY_POSITION,), TRXL, text="(7.1.3) helps a little"),
+            "query-position-gru": in_endless(
+                GRU, (QUERY_POSITION, f"{QUERY_POSITION} --trxl-dim 96"), text="(7.1.3) still behind GRU"
+            ),
+            "query-output": in_endless(TRXL, ("TrXL --trxl-query-output",), text="(7.1.3) is catastrophic"),
+            "stale": in_endless(("TrXL, refreshed",), TRXL, text="(7.1.4) refreshed memory helps"),
+            "encodings": in_endless(
+                tuple(f"TrXL --trxl-positional-encoding {kind}" for kind in ("learned", "relative")),
+                TRXL,
+                text="(7.1.5) no better than absolute",
+                expects_difference=False,
+            ),
+        },
     ),
-    "memory-mystery-path": Claim(
-        "6.2.1", "agents with a memory succeed more often than all others in Mystery Path Grid", MYSTERY_PATH,
-        ("GRU", "TrXL"), (*FEW_FRAMES, "stack of 16"),
+    Table(
+        "Normalized advantages make GRU worse (7.2)",
+        ("GRU", NORMALIZED, "no memory --norm-adv minibatch"),
+        {
+            **claims_of("normalized", "mortar-mayhem mystery-path", GRU, (NORMALIZED,)),
+            # Large steps are what the thesis suspects, and --target-kl would prevent them.
+            **claims_of(
+                "normalized",
+                "all-in-view",
+                ("GRU", "no memory --norm-adv minibatch"),
+                (NORMALIZED,),
+                flags="--target-kl None",
+            ),
+            "normalized-gradients": Claim("all-in-view", (NORMALIZED,), GRU, gradient_norm, flags="--target-kl None"),
+        },
     ),
-    "memory-full-mystery-path": Claim(
-        "6.2.1", "agents with a memory succeed more often than all others in the full Mystery Path", FULL_MYSTERY_PATH,
-        ("GRU", WIDE_TRXL), (*FEW_FRAMES, "stack of 16"),
-    ),
-    "memory-full-mystery-path-grid": Claim(
-        "6.2.1", "the same in the full Mystery Path Grid", FULL_MYSTERY_PATH_GRID,
-        ("GRU", WIDE_TRXL), (*FEW_FRAMES, "stack of 16"),
-    ),
-    "stack-goal-in-view": Claim(
-        "6.2.1", "with origin and goal in view, memory or a stack of 16 solves Mystery Path Grid, fewer frames do not",
-        GOAL_IN_VIEW, ("stack of 16", "GRU", "TrXL"), FEW_FRAMES,
-    ),
-    "memory-full-spotlights": Claim(
-        "6.2.1", "agents with a memory succeed more often than all others in the full Searing Spotlights",
-        FULL_SPOTLIGHTS,
-        ("GRU", WIDE_TRXL), (*FEW_FRAMES, "stack of 16"),
-    ),
-    "samples-mortar-mayhem": Claim(
-        "6.2.2", "TrXL takes fewer samples than GRU in Mortar Mayhem Grid", MORTAR_MAYHEM, ("TrXL",), ("GRU",), area
-    ),
-    "samples-small-values": Claim(
-        "6.2.2", "the same, with fresh values near 0 (`--value-init-gain 0.01`)", MORTAR_MAYHEM,
-        ("TrXL --value-init-gain 0.01",), ("GRU --value-init-gain 0.01",), area,
-    ),
-    "samples-mystery-path": Claim(
-        "6.2.2", "TrXL takes fewer samples than GRU in Mystery Path Grid", MYSTERY_PATH, ("TrXL",), ("GRU",), area
-    ),
-    "samples-commands-in-view": Claim(
-        "6.2.2", "GRU takes fewer samples than TrXL in Mortar Mayhem Act Grid", COMMANDS_IN_VIEW,
-        ("GRU",), ("TrXL",), area,
-    ),
-    "samples-goal-in-view": Claim(
-        "6.2.2", "GRU takes fewer samples than TrXL in Mystery Path Grid with origin and goal in view", GOAL_IN_VIEW,
-        ("GRU",), ("TrXL",), area,
-    ),
-    "samples-full-mortar-mayhem": Claim(
-        "6.2.2", "TrXL takes fewer samples than GRU in the full Mortar Mayhem Grid", FULL_MORTAR_MAYHEM,
-        (WIDE_TRXL,), ("GRU",), area,
-    ),
-    "score-free-mortar-mayhem": Claim(
-        "6.2.2", "TrXL completes more commands than GRU in Mortar Mayhem with free movement", FREE_MORTAR_MAYHEM,
-        (WIDE_TRXL,), ("GRU",),
-    ),
-    "samples-full-mystery-path": Claim(
-        "6.2.2", "TrXL takes fewer samples than GRU in the full Mystery Path", FULL_MYSTERY_PATH,
-        (WIDE_TRXL,), ("GRU",), area,
-    ),
-    "samples-full-spotlights": Claim(
-        "6.2.2", "GRU takes fewer samples than TrXL in the full Searing Spotlights", FULL_SPOTLIGHTS,
-        ("GRU",), (WIDE_TRXL,), area,
-    ),
-    "lstm-mortar-mayhem": Claim(
-        "6.2.3", "LSTM completes fewer commands than GRU in Mortar Mayhem Grid", MORTAR_MAYHEM, ("GRU",), ("LSTM",)
-    ),
-    "lstm-mystery-path": Claim(
-        "6.2.3", "LSTM takes more samples than GRU in Mystery Path", MYSTERY_PATH, ("GRU",), ("LSTM",), area
-    ),
-    "gates-mortar-mayhem": Claim(
-        "6.2.3", "GTrXL completes fewer commands than TrXL in Mortar Mayhem Grid", MORTAR_MAYHEM, ("TrXL",), ("GTrXL",)
-    ),
-    "gates-mystery-path": Claim(
-        "6.2.3", "GTrXL takes more samples than TrXL in Mystery Path", MYSTERY_PATH, ("TrXL",), ("GTrXL",), area
-    ),
-    "lstm-full-mortar-mayhem": Claim(
-        "6.2.3", "LSTM completes fewer commands than GRU in the full Mortar Mayhem Grid", FULL_MORTAR_MAYHEM,
-        ("GRU",), ("LSTM",),
-    ),
-    "lstm-free-mortar-mayhem": Claim(
-        "6.2.3", "LSTM completes fewer commands than GRU in Mortar Mayhem with free movement", FREE_MORTAR_MAYHEM,
-        ("GRU",), ("LSTM",),
-    ),
-    "lstm-full-mystery-path": Claim(
-        "6.2.3", "LSTM takes more samples than GRU in the full Mystery Path", FULL_MYSTERY_PATH,
-        ("GRU",), ("LSTM",), area,
-    ),
-    "lstm-full-spotlights": Claim(
-        "6.2.3", "LSTM takes more samples than GRU in the full Searing Spotlights", FULL_SPOTLIGHTS,
-        ("GRU",), ("LSTM",), area,
-    ),
-    "gates-full-mortar-mayhem": Claim(
-        "6.2.3", "GTrXL completes fewer commands than TrXL in the full Mortar Mayhem Grid", FULL_MORTAR_MAYHEM,
-        (WIDE_TRXL,), (WIDE_GTRXL,),
-    ),
-    "gates-free-mortar-mayhem": Claim(
-        "6.2.3", "GTrXL completes fewer commands than TrXL in Mortar Mayhem with free movement", FREE_MORTAR_MAYHEM,
-        (WIDE_TRXL,), (WIDE_GTRXL,),
-    ),
-    "gates-full-mystery-path": Claim(
-        "6.2.3", "GTrXL takes more samples than TrXL in the full Mystery Path", FULL_MYSTERY_PATH,
-        (WIDE_TRXL,), (WIDE_GTRXL,), area,
-    ),
-    "gates-full-spotlights": Claim(
-        "6.2.3", "GTrXL takes more samples than TrXL in the full Searing Spotlights", FULL_SPOTLIGHTS,
-        (WIDE_TRXL,), (WIDE_GTRXL,), area,
-    ),
-    "gate-bias": Claim(
-        "6.2.3", "a gate bias of 0 is better than one of 2 in Mystery Path", MYSTERY_PATH,
-        ("GTrXL",), ("GTrXL --trxl-gate-bias 2",),
-    ),
-    "endless": Claim(
-        "6.3", "GRU completes more commands than TrXL in Endless Mortar Mayhem", ENDLESS, ("GRU",), ("TrXL",)
-    ),
-    "endless-long": Claim(
-        "6.3, 7.1.3", "the same after 12 million steps, TrXL with more parameters and the step in the query",
-        LONG_ENDLESS, ("GRU",), (WIDE_QUERY_POSITION,),
-    ),
-    "endless-full": Claim(
-        "6.3", "GRU completes more commands than TrXL in the full Endless Mortar Mayhem", FULL_ENDLESS,
-        ("GRU",), (WIDE_TRXL,),
-    ),
-    "endless-mystery-path": Claim(
-        "6.3", "GRU has a higher return than TrXL in Endless Mystery Path", ENDLESS_MYSTERY_PATH,
-        ("GRU",), (WIDE_TRXL,),
-    ),
-    "endless-spotlights": Claim(
-        "6.3", "GRU collects more coins than TrXL in Endless Searing Spotlights", ENDLESS_SPOTLIGHTS,
-        ("GRU",), (WIDE_TRXL,),
-    ),
-    "falls": Claim(
-        "6.5.2", "TrXL falls off less often than GRU in Mystery Path", MYSTERY_PATH, ("GRU",), ("TrXL",), falls
-    ),
-    "falls-full-mystery-path": Claim(
-        "6.5.2", "TrXL falls off less often than GRU in the full Mystery Path", FULL_MYSTERY_PATH,
-        ("GRU",), (WIDE_TRXL,), falls,
-    ),
-    "capacity": Claim(
-        "7.1.1", "more width, blocks or window do not bring TrXL to GRU's level", ENDLESS, ("GRU",),
-        ("TrXL --trxl-dim 96", "TrXL --trxl-num-layers 3", "TrXL --trxl-memory-length 256"),
-    ),
-    "ground-truth": Claim(
-        "7.1.2", "estimating the ground truth helps TrXL", ENDLESS, ("TrXL --ground-truth-coef 0.1",), ("TrXL",)
-    ),
-    "learning-rate": Claim("7.1.2", "a higher final learning rate helps TrXL", ENDLESS, (TO_1E_4,), (TO_1E_5,)),
-    "query-position": Claim(
-        "7.1.3", "the step's encoding in the query helps TrXL, a little", ENDLESS,
-        ("TrXL --trxl-query-position",), ("TrXL",),
-    ),
-    "query-position-gru": Claim(
-        "7.1.3", "it does not bring TrXL to GRU's level", ENDLESS, ("GRU",),
-        ("TrXL --trxl-query-position", "TrXL --trxl-query-position --trxl-dim 96"),
-    ),
-    "query-output": Claim(
-        "7.1.3", "the last output in the query is catastrophic", ENDLESS, ("TrXL",), ("TrXL --trxl-query-output",)
-    ),
-    "stale": Claim(
-        "7.1.4", "stored items that are refreshed help TrXL (a hypothesis)", ENDLESS, ("TrXL, refreshed",), ("TrXL",)
-    ),
-    "encodings": Claim(
-        "7.1.5", "learned and relative encodings are no better than the absolute one", ENDLESS,
-        ("TrXL --trxl-positional-encoding learned", "TrXL --trxl-positional-encoding relative"), ("TrXL",),
-        expects_difference=False,
-    ),
-    "normalized": Claim(
-        "7.2", "normalized advantages spoil GRU in Searing Spotlights with all in view, an agent without memory less",
-        ALL_IN_VIEW, (NOT_NORMALIZED, "no memory --target-kl None --norm-adv minibatch"), (NORMALIZED,),
-    ),
-    "normalized-gradients": Claim(
-        "7.2", "normalized advantages make gradients larger", ALL_IN_VIEW,
-        (NORMALIZED,), (NOT_NORMALIZED,), gradient_norm,
-    ),
-    "normalized-mortar-mayhem": Claim(
-        "7.2", "Mortar Mayhem is learned better without normalized advantages", MORTAR_MAYHEM,
-        ("GRU",), ("GRU --norm-adv minibatch",),
-    ),
-    "normalized-mystery-path": Claim(
-        "7.2", "Mystery Path is learned better without normalized advantages", MYSTERY_PATH,
-        ("GRU",), ("GRU --norm-adv minibatch",),
-    ),
-}  # fmt: skip
+)
+CLAIMS = {name: claim for table in TABLES for name, claim in table.claims.items()}
 
 
 @dataclass
@@ -311,7 +237,7 @@ class Config(learning.Training):
     """Which claims to test."""
 
     claims: tuple[str, ...] = tuple(CLAIMS)
-    """of those that this program knows"""
+    """names in the first column of docs/claims.md"""
 
 
 @dataclass(frozen=True)
@@ -362,8 +288,8 @@ def is_learned(claim: Claim, runs: dict[str, list[evaluate.RunLog]], without: li
     """
     if not without:
         return True
-    base = score(claim.task, without)
-    scores = [score(claim.task, members) for agent, members in runs.items() if not agent.startswith("no memory")]
+    base = score(TASKS[claim.task], without)
+    scores = [score(TASKS[claim.task], members) for agent, members in runs.items() if not agent.startswith("no memory")]
     return any(Comparison.of(each, base).errors >= DECIDED for each in scores)
 
 
@@ -375,17 +301,51 @@ def holm(p_values: list[float], level: float = 0.05) -> list[bool]:
     return passed[np.argsort(order)].tolist()
 
 
-def row(name: str, runs: dict[str, list[evaluate.RunLog]], found: str) -> str:
-    """Return a claim's row of the table, from the seeds of its agents: their means and standard errors."""
-    claim = CLAIMS[name]
+def short(agent: str) -> str:
+    """Return an agent's name for the tables: its flags in words; without TrXL, of which most are variants."""
+    name = re.sub(r" --(?:trxl-)?([\w-]+)", lambda found: f", {found[1].replace('-', ' ')}", agent)
+    return name.removeprefix("TrXL, ")
 
-    def cell(agents: tuple[str, ...]) -> str:
-        numbers = {suites.short(agent): claim.measure(claim.task, runs[agent])[..., None] for agent in agents}
-        return ", ".join(f"{agent} {tables.mean_and_error(each)}" for agent, each in numbers.items())
 
-    measure = claim.measure.__name__.replace("_", " ")
-    text = f"{claim.text} ({claim.section}; `{name}`)"
-    return f"| {text} | {measure} | {cell(claim.higher)} | {cell(claim.lower)} | {found} |"
+def heading(table: Table) -> str:
+    """Return a table's title and its first two lines."""
+    names = ["claim", *map(short, table.columns), *["variants"] * table.has_variants, "verdict"]
+    return f"\n## {table.title}\n\n| {' | '.join(names)} |\n|{'---|' * len(names)}"
+
+
+def mean_and_error(numbers: np.ndarray) -> str:
+    """Return the mean of numbers (R, M) with its standard error, without spaces: tables have many columns."""
+    return learning.mean_and_error(numbers[..., None]).replace(" ", "")
+
+
+def row(table: Table, name: str, runs: dict[str, list[evaluate.RunLog]], found: str) -> str:
+    """Return a claim's row, from the seeds of its agents: their means and standard errors, bold if expected higher."""
+    claim = table.claims[name]
+    numbers = {agent: mean_and_error(claim.numbers(runs[agent])) for agent in claim.agents}
+    if claim.expects_difference:
+        numbers |= {agent: f"**{numbers[agent]}**" for agent in claim.higher}
+    cells = [f"`{name}` {claim.text}".strip(), *(numbers.get(agent, "") for agent in table.columns)]
+    if table.has_variants:
+        variants = [agent for agent in claim.agents if agent not in table.columns]
+        cells.append(", ".join(f"{short(agent)}: {numbers[agent]}" for agent in variants))
+    return f"| {' | '.join([*cells, found])} |"
+
+
+def judge(claim: Claim, runs: dict[str, list[evaluate.RunLog]], without: list[evaluate.RunLog]) -> Verdict:
+    """Return the verdict on a claim, from the runs of its agents and, if they are there, of one without memory."""
+    if not is_learned(claim, runs, without):
+        return Verdict("not learned")
+    numbers = {agent: claim.numbers(members) for agent, members in runs.items()}
+    pairs = itertools.product(claim.higher, claim.lower)
+    return verdict(claim, [Comparison.of(numbers[one], numbers[other]) for one, other in pairs])
+
+
+def finished(config: Config, plans: list[learning.Plan], results: dict) -> list[evaluate.RunLog]:
+    """Return the runs that are there; `results` keeps what has been read, by the plans' commands."""
+    for plan in plans:
+        if plan.command not in results:
+            results[plan.command] = learning.result_of(config, plan)
+    return [results[plan.command] for plan in plans if results[plan.command] is not None]
 
 
 def main(config: Config) -> None:
@@ -396,36 +356,27 @@ def main(config: Config) -> None:
     learning.check(config)
     if unknown := [name for name in config.claims if name not in CLAIMS]:
         raise SystemExit(f"there is no claim {unknown[0]}; there are {', '.join(CLAIMS)}")
-    plans = {}
-    for name in config.claims:
-        claim = CLAIMS[name]
-        runs = itertools.product((*claim.higher, *claim.lower), config.seeds)
-        plans[name] = [learning.plan(config, claim.task, agent, seed) for agent, seed in runs]
-    each_once = {plan.command: plan for plan in itertools.chain(*plans.values())}  # claims share runs
+    claims = {name: claim for name, claim in CLAIMS.items() if name in config.claims}
+    plans = {name: {agent: claim.plans(config, agent) for agent in claim.agents} for name, claim in claims.items()}
     if not config.report:
-        learning.train_missing(config, [*each_once.values()])
-    results = {command: learning.result_of(config, plan) for command, plan in each_once.items()}
-    runs, verdicts = {}, {}
-    for name in config.claims:
-        claim = CLAIMS[name]
-        found = {agent: [] for agent in (*claim.higher, *claim.lower)}
-        for each in plans[name]:
-            found[each.agent] += [run for run in [results[each.command]] if run is not None]
-        missing = sum(len(config.seeds) - len(members) for members in found.values())
-        if missing:
-            print(f"`{name}` is not tested: {missing} of {len(plans[name])} runs are missing")
+        each_once = {plan.command: plan for agents in plans.values() for seeds in agents.values() for plan in seeds}
+        learning.train_missing(config, [*each_once.values()])  # claims share runs
+    results, runs, verdicts = {}, {}, {}
+    for name, claim in claims.items():
+        runs[name] = {agent: finished(config, seeds, results) for agent, seeds in plans[name].items()}
+        wanted, found = (sum(map(len, each.values())) for each in (plans[name], runs[name]))
+        if found < wanted:
+            print(f"`{name}` is not tested: {wanted - found} of {wanted} runs are missing")
             continue
-        without = [learning.result_of(config, learning.plan(config, claim.task, "no memory", i)) for i in config.seeds]
-        runs[name] = found
-        pairs = itertools.product(claim.higher, claim.lower)
-        measured = {agent: claim.measure(claim.task, members) for agent, members in found.items()}
-        verdicts[name] = verdict(claim, [Comparison.of(measured[one], measured[other]) for one, other in pairs])
-        if None not in without and not is_learned(claim, found, without):
-            verdicts[name] = Verdict("not learned")
+        seeds = [learning.plan(config, TASKS[claim.task], "no memory", seed) for seed in config.seeds]
+        without = finished(config, seeds, results)
+        verdicts[name] = judge(claim, runs[name], without if len(without) == len(seeds) else [])
     stars = dict(zip(verdicts, holm([each.p_value for each in verdicts.values()]), strict=True))
-    print("| claim | measure | expected higher | expected lower | verdict |\n|---|---|---|---|---|")
-    for name, found in verdicts.items():
-        print(row(name, runs[name], found.text + " \\*" * stars[name]))
+    for table in TABLES:
+        if names := [name for name in verdicts if name in table.claims]:
+            print(heading(table))
+        for name in names:
+            print(row(table, name, runs[name], verdicts[name].text + " \\*" * stars[name]))
     counts = Counter(found.text for found in verdicts.values())
     summary = ", ".join(f"{count} {text}" for text, count in counts.most_common())
     print(f"\nOf {len(verdicts)} rows: {summary}. With a star: {sum(stars.values())}.")
