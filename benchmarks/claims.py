@@ -37,25 +37,27 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other pac
 
 import evaluate
 import learning
-from learning import Task
+import suites
+import tables
+from suites import Task
 
 IN_VIEW = {"command_count": [4], "explosion_delay": [4], "explosion_duration": [2]}
 ALL_VISIBLE = {"agent_visible": True, "coins_visible": True, "exit_visible": True}
-PATH, ENDLESS = learning.SMALL["mystery-path"], learning.SMALL["endless-mortar-mayhem"]
-TASKS = learning.TASKS | {
-    "commands-in-view": replace(learning.SMALL["mortar-mayhem"], env_id="MortarMayhemB-Grid-v0", options=IN_VIEW),
+PATH, ENDLESS = suites.SMALL["mystery-path"], suites.SMALL["endless-mortar-mayhem"]
+TASKS = suites.TASKS | {
+    "commands-in-view": replace(suites.SMALL["mortar-mayhem"], env_id="MortarMayhemB-Grid-v0", options=IN_VIEW),
     "goal-in-view": replace(PATH, options=PATH.options | {"show_origin": True, "show_goal": True}),
     "all-in-view": Task("SearingSpotlights-v0", 1_000_000, ALL_VISIBLE),
     "endless-long": replace(ENDLESS, total_timesteps=12_000_000),
 }
-WIDE_TASKS = {*learning.FULL, "endless-long"}  # here, transformers have about as many parameters as the GRU
+WIDE_TASKS = {*suites.FULL, "endless-long"}  # here, transformers have about as many parameters as the GRU
 DECIDED = 2.0  # standard errors of a difference
 
 
 # What is compared, (R, M): of each seed, on each level.
 def score(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
     """Return the scores of the final weights."""
-    return learning.final_scores(task.score, runs).mean(-1)
+    return tables.final_scores(task.score, runs).mean(-1)
 
 
 def area(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
@@ -65,7 +67,7 @@ def area(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
 
 def falls(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
     """Return how often the final weights fall off."""
-    return learning.final_scores("num_fails", runs).mean(-1)
+    return tables.final_scores("num_fails", runs).mean(-1)
 
 
 def gradient_norm(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
@@ -96,7 +98,7 @@ class Claim:
     def plans(self, config: learning.Training, agent: str) -> list[learning.Plan]:
         """Return the trainings of one of the agents, one for each seed."""
         name, *own = agent.split(" --", 1)
-        wide = [learning.WIDE] if self.task in WIDE_TASKS and "TrXL" in name else []
+        wide = [suites.WIDE] if self.task in WIDE_TASKS and "TrXL" in name else []
         trained = " ".join([name, *self.flags.split(), *(f"--{flags}" for flags in own), *wide])
         return [learning.plan(config, TASKS[self.task], trained, seed) for seed in config.seeds]
 
@@ -315,7 +317,7 @@ def heading(table: Table) -> str:
 
 def mean_and_error(numbers: np.ndarray) -> str:
     """Return the mean of numbers (R, M) with its standard error, without spaces: tables have many columns."""
-    return learning.mean_and_error(numbers[..., None]).replace(" ", "")
+    return tables.mean_and_error(numbers[..., None]).replace(" ", "")
 
 
 def row(table: Table, name: str, runs: dict[str, list[evaluate.RunLog]], found: str) -> str:

@@ -9,6 +9,8 @@ import scipy.stats
 
 import claims
 import learning
+import suites
+import tables
 
 ROOT = Path(__file__).parents[1]
 
@@ -90,7 +92,7 @@ def test_agents_have_their_claims_flags_and_the_tasks_width():
     def agents(claim):
         return [claim.plans(claims.Config(seeds=(1,)), agent)[0].agent for agent in claim.agents]
 
-    wide = learning.WIDE
+    wide = suites.WIDE
     assert agents(claims.CLAIMS["gates-score-MortarMayhem-v0"]) == [f"TrXL {wide}", f"GTrXL {wide}"]
     assert agents(claims.CLAIMS["endless-long"]) == ["GRU", f"TrXL --trxl-query-position {wide}"]
     assert agents(claims.CLAIMS["query-position"]) == ["TrXL --trxl-query-position", "TrXL"]
@@ -109,7 +111,7 @@ def test_every_claim_compares_agents_that_can_be_trained(name):
 
 def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     small = "--num-envs 2 --num-steps 32 --num-minibatches 2 --trunk-size 8 --eval-levels 2"
-    agents = {name: f"{flags} {small}" for name, flags in learning.AGENTS.items()}
+    agents = {name: f"{flags} {small}" for name, flags in suites.AGENTS.items()}
     monkeypatch.setattr(learning, "AGENTS", agents)
     config = claims.Config(
         claims=("normalized-gradients",), steps_scale=64 / 1e6, seeds=(1, 2), evaluations=1, folder=tmp_path / "runs"
@@ -122,7 +124,7 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     for agent in ("GRU", claims.NORMALIZED):
         runs = [learning.result_of(config, each) for each in claims.CLAIMS["normalized-gradients"].plans(config, agent)]
         norms = [run.curves["losses/grad_norm"][1].mean() for run in runs]
-        cells.append(learning.mean_and_error(np.reshape(norms, (2, 1, 1))).replace(" ", ""))
+        cells.append(tables.mean_and_error(np.reshape(norms, (2, 1, 1))).replace(" ", ""))
     row = f"| `normalized-gradients` | {cells[0]} | **{cells[1]}** |  | "
     assert any(line.startswith(row) for line in told.splitlines())
     assert told.splitlines()[-1].startswith("Of 1 rows: 1 ")
