@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/envs"))
 
 from players import choices, player
 
-from learning import FIRST_TEST_LEVEL, TEST_LEVELS
+from learning import FIRST_TEST_LEVEL, Training
 from suites import FULL, SMALL, Task
 from tables import BOUNDS
 
@@ -41,7 +41,9 @@ def scripted_player(envs: gym.vector.VectorEnv, rng: np.random.Generator) -> np.
     return player(envs)
 
 
-def play(task: Task, actions_of: Callable, levels: int = TEST_LEVELS, max_steps: int = MAX_STEPS) -> np.ndarray:
+def play(
+    task: Task, actions_of: Callable, levels: int = Training.test_levels, max_steps: int = MAX_STEPS
+) -> np.ndarray:
     """Return a player's score on each test level, (M,)."""
     envs = gym.make_vec(task.env_id, num_envs=levels, obs_type="vector", max_episode_steps=max_steps)
     envs.reset(seed=FIRST_TEST_LEVEL, options=task.options)
@@ -56,7 +58,7 @@ def play(task: Task, actions_of: Callable, levels: int = TEST_LEVELS, max_steps:
     return scores
 
 
-def main(out: Path = BOUNDS, levels: int = TEST_LEVELS, max_steps: int = MAX_STEPS) -> None:
+def main(out: Path = BOUNDS, levels: int = Training.test_levels, max_steps: int = MAX_STEPS) -> None:
     """Write the mean scores over levels.
 
     Args:

@@ -8,7 +8,7 @@
 The small suite has tasks that take minutes on a core, the full one the ten environments as they are. Agents have
 vector observations and small networks, and all see the same vectors, a frame stack the last few. Two sets of levels
 are outside of the training set. Evaluations during training (6.1.3) are on the development levels, which follow the
-training's: curves are made of them, settings and seeds chosen by them. At the end, the final weights play TEST_LEVELS
+training's: curves are made of them, settings and seeds chosen by them. At the end, the final weights play 1,000
 test levels once: what is published is their score.
 
 What a run reached is kept in a file of a few KB, in a folder of --results for its environment; `evaluate.py --curves`
@@ -45,13 +45,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other pac
 
 import evaluate
 import tables
-from ppo_utils.flags import check_args, check_minibatches
+from ppo_utils.flags import check_args, check_minibatches, flag
 from ppo_utils.runs import parse_args
 from suites import AGENTS, SUITES, TASKS, Task, short
 
 ROOT = Path(__file__).parent.parent
 COMMON = "--preset laptop --save-model"
-TEST_LEVELS, FIRST_TEST_LEVEL = 1000, 1_000_000
+FIRST_TEST_LEVEL = 1_000_000
 
 
 @dataclass
@@ -66,6 +66,8 @@ class Training:
     """runs at the same time; they share the cores, or have OMP_NUM_THREADS threads each if that is set"""
     evaluations: int = 20
     """evaluations of a training, and one more at its end where they do not divide it evenly"""
+    test_levels: int = 1000
+    """levels that the final weights play once, from FIRST_TEST_LEVEL on"""
     folder: Path = Path("learning")
     """where the runs go"""
     results: Path = Path("learning/results")
@@ -120,9 +122,9 @@ class Plan:
 
 def check(config: Training) -> None:
     """Raise SystemExit for numbers that no training can have."""
-    for name in ("jobs", "evaluations"):
+    for name in ("jobs", "evaluations", "test_levels"):
         if getattr(config, name) < 1:
-            raise SystemExit(f"--{name} is {getattr(config, name)}; it must be 1 or more")
+            raise SystemExit(f"{flag(name)} is {getattr(config, name)}; it must be 1 or more")
     if not 0 < config.steps_scale < math.inf:
         raise SystemExit(f"--steps-scale is {config.steps_scale}; it must be a number above 0")
     if not config.seeds or len(set(config.seeds)) < len(config.seeds):
@@ -278,19 +280,19 @@ def write_result(config: Training, plan: Plan) -> None:
             f"{plan}, has no {metric} at its end: an evaluation was cut short; give the agent more steps, as "
             f'"{plan.agent} --eval-max-steps 100000"'
         )
-    curves = run.curves | test_scores(plan, run)
+    curves = run.curves | test_scores(config, plan, run)
     result = config.results / plan.task.env_id / f"{Path(run.path).name}.json.gz"
     result.parent.mkdir(parents=True, exist_ok=True)
     evaluate.write_run(replace(run, curves=curves, machine=machine()), str(result))
 
 
-def test_scores(plan: Plan, run: evaluate.RunLog) -> dict[str, tuple[list[int], np.ndarray]]:
+def test_scores(config: Training, plan: Plan, run: evaluate.RunLog) -> dict[str, tuple[list[int], np.ndarray]]:
     """Let the run's final weights play the test levels; return a curve of one point for each metric.
 
     Raises SystemExit if that fails.
     """
     scores = Path(run.path) / "test_scores.json"
-    flags = ["--start-level", FIRST_TEST_LEVEL, "--levels", TEST_LEVELS, "--repeats", 1, "--json", scores]
+    flags = ["--start-level", FIRST_TEST_LEVEL, "--levels", config.test_levels, "--repeats", 1, "--json", scores]
     command = [sys.executable, ROOT / "evaluate.py", Path(run.path) / "model.pt", *flags]
     done = subprocess.run([str(each) for each in command], capture_output=True, text=True, check=False)
     if done.returncode:

@@ -116,7 +116,7 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     config = claims.Config(
         claims=("normalized-gradients",), steps_scale=64 / 1e6, seeds=(1, 2), evaluations=1, folder=tmp_path / "runs"
     )
-    config.results = tmp_path / "results"
+    config.results, config.test_levels = tmp_path / "results", 2
     claims.main(config)
     told = capsys.readouterr().out
     assert told.count("trained GRU") == 4

@@ -23,6 +23,7 @@ import evaluate
 import learning
 import ppo_gru
 from ppo_utils.runs import run_to_end
+from suites import short
 
 ROOT = Path(__file__).parents[1]
 
@@ -57,6 +58,7 @@ def test_an_agent_may_have_further_flags(tmp_path):
         ({"seeds": (1, 2, 1)}, "--seeds is 1 2 1; give at least one, and each once"),
         ({"jobs": 0}, "--jobs is 0; it must be 1 or more"),
         ({"evaluations": 0}, "--evaluations is 0; it must be 1 or more"),
+        ({"test_levels": 0}, "--test-levels is 0; it must be 1 or more"),
         ({"steps_scale": 0}, "--steps-scale is 0; it must be a number above 0"),
         ({"steps_scale": float("nan")}, "--steps-scale is nan; it must be a number above 0"),
     ],
@@ -111,13 +113,13 @@ def test_an_agent_goes_on_with_no_other_run(tmp_path):
 def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, capsys):
     small = "--num-envs 4 --num-steps 32 --num-minibatches 2 --hidden-size 8 --eval-levels 2"
     agent, task = f"GRU, refreshed {small}", learning.TASKS["mortar-mayhem"]
-    monkeypatch.setattr(learning, "TEST_LEVELS", 5)
     config = learning.Config(
         tasks=("mortar-mayhem",),
         agents=(agent,),
         steps_scale=3 * 128 / task.total_timesteps,
         seeds=(1,),
         evaluations=3,
+        test_levels=5,
         folder=tmp_path / "learning",
         results=tmp_path / "results",
         out=tmp_path / "curves.png",
@@ -163,7 +165,7 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     told = capsys.readouterr().out
     assert "trained" not in told
     score = tested.mean()
-    assert f"\n| {agent} | {score:.2f} | {evaluate.iqm(tested):.2f} | {score:.2f} |" in told
+    assert f"\n| {short(agent)} | {score:.2f} | {evaluate.iqm(tested):.2f} | {score:.2f} |" in told
     assert f"\nRuns: 1, together 0.0 hours without evaluations. Machines: {kept.machine}\n" in told
     assert config.out.stat().st_size > 10_000
 
@@ -171,8 +173,8 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     config = replace(config, report=True, agents=(agent, other), seeds=(1, 2))
     learning.main(config)
     told = capsys.readouterr().out
-    missing = f"mortar-mayhem: runs without a result: 1 of {agent}; 2 of {other}\n"
-    assert ("trained" not in told, missing in told, f"| {agent} | {score:.2f} |" in told) == (True,) * 3
+    missing = f"mortar-mayhem: runs without a result: 1 of {short(agent)}; 2 of {short(other)}\n"
+    assert ("trained" not in told, missing in told, f"| {short(agent)} | {score:.2f} |" in told) == (True,) * 3
     assert not config.folder.exists() or not [*config.folder.iterdir()]
     with pytest.raises(SystemExit, match="nowhere has no results of these agents; without --report they are trained"):
         learning.main(replace(config, results=tmp_path / "nowhere"))
