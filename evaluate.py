@@ -129,15 +129,29 @@ def iqm(scores: np.ndarray) -> np.ndarray:
 def standard_error(scores: np.ndarray) -> float:
     """Return the standard error of the mean of scores (R, M, E), for other seeds and other levels.
 
-    All seeds play the same levels, so the variance of the mean has two parts: that of the seeds' means over R, and that
-    of the levels' means over M, each estimated without bias. A bootstrap over seeds and levels estimates the same, but
-    with three seeds has two thirds of the first part. With one seed, NaN; of a single level, the first part alone.
+    All seeds play the same levels, so the variance of the mean has two parts, `seed_variance` and that of the levels'
+    means over M (a two-way model with random effects). A bootstrap over seeds and levels estimates the same, but with
+    three seeds has two thirds of the first part. With one seed, NaN.
     """
-    seeds, levels = scores.mean((1, 2)), scores.mean((0, 2))
-    if len(seeds) < 2:
-        return math.nan
-    of_levels = levels.var(ddof=1) / len(levels) if len(levels) > 1 else 0.0
-    return math.sqrt(seeds.var(ddof=1) / len(seeds) + of_levels)
+    means = scores.mean(2)  # (R, M)
+    return math.sqrt(seed_variance(means) + level_variance(means.mean(0))) if len(means) > 1 else math.nan
+
+
+def seed_variance(means: np.ndarray) -> float:
+    """Return the part of the variance of the mean of (R, M) that differences between seeds have.
+
+    The seeds' means also vary by what a seed does on these levels more than on others. `level_variance` has that part
+    too, so that it is subtracted here.
+    """
+    seeds, levels = means.shape
+    alone = means - means.mean(1, keepdims=True) - means.mean(0) + means.mean()  # what only that seed and level have
+    both = (alone**2).sum() / ((seeds - 1) * (levels - 1)) / means.size if levels > 1 else 0.0
+    return max(means.mean(1).var(ddof=1) / seeds - both, 0.0)
+
+
+def level_variance(means: np.ndarray) -> float:
+    """Return the variance of the mean of levels (M,); of a single level, 0."""
+    return means.var(ddof=1) / len(means) if len(means) > 1 else 0.0
 
 
 def interval(scores: np.ndarray) -> np.ndarray | None:

@@ -2,7 +2,7 @@
 
     python benchmarks/bounds.py
 
-An agent's score stands between them. The player, of tests/envs/players.py, knows the target and walks to it. In Searing
+For comparison with agents. The player, of tests/envs/players.py, knows the target and walks to it. In Searing
 Spotlights it goes straight through the light. In the endless tasks it stops after MAX_STEPS steps, or where the path of
 Endless Mystery Path goes left, where nobody can follow it. Writes benchmarks/bounds.csv; tables of learning.py have its
 scores beside the agents'.

@@ -20,8 +20,6 @@ With --report nothing is trained, and a claim is not tested if runs are missing.
 """
 
 import itertools
-import math
-import re
 import signal
 import sys
 from collections import Counter
@@ -30,7 +28,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import scipy.stats
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
@@ -40,6 +37,7 @@ import learning
 import suites
 import tables
 from suites import Task
+from tables import DECIDED, LEVEL, Comparison
 
 IN_VIEW = {"command_count": [4], "explosion_delay": [4], "explosion_duration": [2]}
 ALL_VISIBLE = {"agent_visible": True, "coins_visible": True, "exit_visible": True}
@@ -51,7 +49,6 @@ TASKS = suites.TASKS | {
     "endless-long": replace(ENDLESS, total_timesteps=12_000_000),
 }
 WIDE_TASKS = {*suites.FULL, "endless-long"}  # here, transformers have about as many parameters as the GRU
-DECIDED = 2.0  # standard errors of a difference
 
 
 # What is compared, (R, M): of each seed, on each level.
@@ -152,9 +149,7 @@ TABLES = (
         ("GRU", "TrXL"),
         {
             **claims_of("samples", "mortar-mayhem MortarMayhem-Grid-v0", TRXL, GRU, measure=area),
-            "samples-small-values": Claim(
-                "mortar-mayhem", TRXL, GRU, area, "(`--value-init-gain 0.01`)", "--value-init-gain 0.01"
-            ),
+            "samples-small-values": Claim("mortar-mayhem", TRXL, GRU, area, flags="--value-init-gain 0.01"),
             **claims_of("score", "MortarMayhem-v0", TRXL, GRU),
             **claims_of("samples", "mystery-path MysteryPath-v0", TRXL, GRU, measure=area),
             **claims_of("samples", "SearingSpotlights-v0 commands-in-view goal-in-view", GRU, TRXL, measure=area),
@@ -243,28 +238,6 @@ class Config(learning.Training):
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """Two agents' numbers: by how many standard errors the first one's mean is higher, and how surely it is another."""
-
-    errors: float
-    p_value: float  # two-sided
-
-    @classmethod
-    def of(cls, higher: np.ndarray, lower: np.ndarray) -> "Comparison":
-        """Compare numbers (R, M) of the seeds of two agents, which played the same M levels.
-
-        The variance of the difference has a part of each agent's seeds, and one of the levels' differences.
-        """
-        seeds = sum(each.mean(1).var(ddof=1) / len(each) for each in (higher, lower))
-        levels = higher.mean(0) - lower.mean(0)  # (M,)
-        if len(levels) > 1:
-            seeds += levels.var(ddof=1) / len(levels)
-        difference = levels.mean()
-        errors = difference / math.sqrt(seeds) if seeds else math.copysign(math.inf, difference) if difference else 0.0
-        return cls(errors, 2 * scipy.stats.t.sf(abs(errors), len(higher) + len(lower) - 2))
-
-
-@dataclass(frozen=True)
 class Verdict:
     """A verdict on a claim, and the p-value of what it says; 1 where it says nothing."""
 
@@ -276,11 +249,17 @@ def verdict(claim: Claim, pairs: list[Comparison]) -> Verdict:
     """Return the verdict on a claim, from the comparisons of its pairs."""
     above = [pair.p_value for pair in pairs if pair.errors >= DECIDED]
     below = [pair.p_value for pair in pairs if pair.errors <= -DECIDED]
+    # That one pair of several is decided is as likely as Bonferroni says, that all are, as the least sure one.
     if not claim.expects_difference:
-        return Verdict("contradicted", min(1, len(pairs) * min(above))) if above else Verdict("not contradicted")
-    if below:
-        return Verdict("does not hold", min(1, len(pairs) * min(below)))
-    return Verdict("holds", max(above)) if len(above) == len(pairs) else Verdict("not decided")
+        found = Verdict("contradicted", min(1, len(pairs) * min(above, default=1)))
+        return found if found.p_value < LEVEL else Verdict("not contradicted")
+    for found in (
+        Verdict("does not hold", min(1, len(pairs) * min(below, default=1))),
+        Verdict("holds", max(above) if len(above) == len(pairs) else 1),
+    ):
+        if found.p_value < LEVEL:
+            return found
+    return Verdict("not decided")
 
 
 def is_learned(claim: Claim, runs: dict[str, list[evaluate.RunLog]], without: list[evaluate.RunLog]) -> bool:
@@ -292,7 +271,7 @@ def is_learned(claim: Claim, runs: dict[str, list[evaluate.RunLog]], without: li
         return True
     base = score(TASKS[claim.task], without)
     scores = [score(TASKS[claim.task], members) for agent, members in runs.items() if not agent.startswith("no memory")]
-    return any(Comparison.of(each, base).errors >= DECIDED for each in scores)
+    return any(Comparison.of(each, base).is_ahead for each in scores)
 
 
 def holm(p_values: list[float], level: float = 0.05) -> list[bool]:
@@ -304,9 +283,8 @@ def holm(p_values: list[float], level: float = 0.05) -> list[bool]:
 
 
 def short(agent: str) -> str:
-    """Return an agent's name for the tables: its flags in words; without TrXL, of which most are variants."""
-    name = re.sub(r" --(?:trxl-)?([\w-]+)", lambda found: f", {found[1].replace('-', ' ')}", agent)
-    return name.removeprefix("TrXL, ")
+    """Return an agent's name for the tables: without TrXL, of which most are variants."""
+    return suites.short(agent).removeprefix("TrXL, ")
 
 
 def heading(table: Table) -> str:
@@ -326,7 +304,11 @@ def row(table: Table, name: str, runs: dict[str, list[evaluate.RunLog]], found: 
     numbers = {agent: mean_and_error(claim.numbers(runs[agent])) for agent in claim.agents}
     if claim.expects_difference:
         numbers |= {agent: f"**{numbers[agent]}**" for agent in claim.higher}
-    cells = [f"`{name}` {claim.text}".strip(), *(numbers.get(agent, "") for agent in table.columns)]
+    flags = f"(`{claim.flags}`)" if claim.flags else ""
+    cells = [
+        " ".join(filter(None, (f"`{name}`", claim.text, flags))),
+        *(numbers.get(agent, "") for agent in table.columns),
+    ]
     if table.has_variants:
         variants = [agent for agent in claim.agents if agent not in table.columns]
         cells.append(", ".join(f"{short(agent)}: {numbers[agent]}" for agent in variants))

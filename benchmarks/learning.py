@@ -9,7 +9,7 @@ The small suite has tasks that take minutes on a core, the full one the ten envi
 vector observations and small networks, and all see the same vectors, a frame stack the last few. Two sets of levels
 are outside of the training set. Evaluations during training (6.1.3) are on the development levels, which follow the
 training's: curves are made of them, settings and seeds chosen by them. At the end, the final weights play 1,000
-test levels once: what is published is their score.
+test levels once: that is their score.
 
 What a run reached is kept in a file of a few KB, in a folder of --results for its environment; `evaluate.py --curves`
 can draw these files too. A run whose file is there is not trained again; one that was stopped goes on from its last
@@ -65,7 +65,7 @@ class Training:
     jobs: int = os.cpu_count() or 1
     """runs at the same time; they share the cores, or have OMP_NUM_THREADS threads each if that is set"""
     evaluations: int = 20
-    """evaluations of a training, and one more at its end where they do not divide it evenly"""
+    """at least so many evaluations of a training, at even distances, and one at its end"""
     test_levels: int = 1000
     """levels that the final weights play once, from FIRST_TEST_LEVEL on"""
     folder: Path = Path("learning")
@@ -238,18 +238,28 @@ def steps_so_far(config: Training, plan: Plan) -> int:
     return int(float(number) * {"": 1, "k": 1e3, "M": 1e6}[unit])
 
 
+def environment(config: Training) -> dict[str, str]:
+    """Return the variables for a training or its evaluation: threads for its share of the cores."""
+    threads = str(max(1, (os.cpu_count() or 1) // config.jobs))
+    return {"OMP_NUM_THREADS": threads, **os.environ, "TQDM_MININTERVAL": "10"}
+
+
 def train(config: Training, plan: Plan) -> None:
     """Run a training, or go on with one that was stopped; raise SystemExit that names its log if it fails."""
     line = plan.command
     for run in runs_in(f"{config.folder}/runs", plan):
         if glob.glob(f"{run.path}/checkpoint-*.pt"):
             line = [*line[:2], "--resume", os.path.relpath(run.path, config.folder)]
-    threads = str(max(1, (os.cpu_count() or 1) // config.jobs))
     log = log_of(config, plan)
-    environment = {"OMP_NUM_THREADS": threads, **os.environ, "TQDM_MININTERVAL": "10"}
     with log.open("a") as output:
         # In a session of its own, Ctrl-C does not reach it: `train_missing` stops it, so that it leaves a checkpoint.
-        how = {"cwd": config.folder, "env": environment, "stdout": output, "stderr": output, "start_new_session": True}
+        how = {
+            "cwd": config.folder,
+            "env": environment(config),
+            "stdout": output,
+            "stderr": output,
+            "start_new_session": True,
+        }
         with subprocess.Popen(line, **how) as process:
             RUNNING.add(process)
             if STOPPING.is_set():  # only since this training was about to begin
@@ -274,13 +284,13 @@ def write_result(config: Training, plan: Plan) -> None:
     if run is None:
         raise SystemExit(f"{plan}, was stopped; the same command goes on with it")
     metric = plan.task.metric
-    steps, _ = run.curves.get(f"eval/{metric}", ([0], None))
-    if steps[-1] != run.last_step:
+    curves = run.curves | test_scores(config, plan, run)
+    ends = [curves.get(f"{levels}/{metric}", ([0], None))[0][-1] for levels in ("eval", "test")]
+    if ends != [run.last_step] * 2:
         raise SystemExit(
             f"{plan}, has no {metric} at its end: an evaluation was cut short; give the agent more steps, as "
             f'"{plan.agent} --eval-max-steps 100000"'
         )
-    curves = run.curves | test_scores(config, plan, run)
     result = config.results / plan.task.env_id / f"{Path(run.path).name}.json.gz"
     result.parent.mkdir(parents=True, exist_ok=True)
     evaluate.write_run(replace(run, curves=curves, machine=machine()), str(result))
@@ -293,8 +303,10 @@ def test_scores(config: Training, plan: Plan, run: evaluate.RunLog) -> dict[str,
     """
     scores = Path(run.path) / "test_scores.json"
     flags = ["--start-level", FIRST_TEST_LEVEL, "--levels", config.test_levels, "--repeats", 1, "--json", scores]
+    flags += ["--max-steps", plan.args.eval_max_steps]
     command = [sys.executable, ROOT / "evaluate.py", Path(run.path) / "model.pt", *flags]
-    done = subprocess.run([str(each) for each in command], capture_output=True, text=True, check=False)
+    how = {"env": environment(config), "capture_output": True, "text": True, "check": False}
+    done = subprocess.run([str(each) for each in command], **how)
     if done.returncode:
         raise SystemExit(f"{plan}, could not be scored: {done.stderr.strip()}")
     (task,) = json.loads(scores.read_text())
@@ -363,9 +375,11 @@ def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
     tasks = config.tasks or suite_tasks
     of_suite = {short(agent): agent for agent in suite_agents}
     agents = {short(name): of_suite.get(name.replace(", preset", "+"), name) for name in config.agents} or of_suite
+    if len(agents) < len(config.agents):
+        raise SystemExit(f"two of these agents have the same name in tables: {', '.join(map(short, config.agents))}")
     scripts = {path.name: path for path in ROOT.glob("ppo_*.py")}
     names = [agent.partition(" --")[0] for agent in agents.values()]
-    for given, known in ((tasks, TASKS), (names, AGENTS | scripts)):
+    for given, known in ((tasks, TASKS), (names, AGENTS | scripts), (config.draw, agents)):
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"there is no {unknown[0]!r}; there are {'; '.join(known)}")
     return {

@@ -23,7 +23,7 @@ from learning import FIRST_TEST_LEVEL
 from pictures import joined, text
 from ppo_utils.acting import Player
 
-SIDE = 252  # pixels of a view, which has 84 of its own
+SIDE = 336  # pixels of a view
 MILLISECONDS = 160  # that a frame is shown
 LAST = 12  # times as long is the last one
 

@@ -161,6 +161,9 @@ COLORS = {  # an agent has the same in every picture
     "TrXL": "tab:orange",
     "GTrXL": "tab:purple",
     "TrXL+": "tab:red",
+    "no memory, Muon": "tab:gray",
+    "GRU, Muon": "tab:blue",
+    "TrXL+, Muon": "tab:red",
 }
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.stats
 from matplotlib import color_sequences
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -21,6 +22,7 @@ import evaluate
 from suites import COLORS, TASKS, Task
 
 BOUNDS = Path(__file__).with_name("bounds.csv")
+DECIDED, LEVEL = 2.0, 0.05  # agents differ by so many standard errors of the difference, and with a p-value below that
 RIVALS = ("no memory", "GRU")  # with which the others are compared over all tasks
 NAMES_APART = 0.075  # between the names at the curves' ends, as a share of the axis
 
@@ -64,6 +66,35 @@ def best_of(task: Task, agents: evaluate.Runs) -> float:
     return task.best_score or max(float(final_scores(task.score, runs).mean()) for runs in agents.values() if runs)
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """Two agents' numbers: by how many standard errors the first one's mean is higher, and how surely it is another."""
+
+    errors: float
+    p_value: float  # two-sided
+
+    @property
+    def is_ahead(self) -> bool:
+        """Return whether the first one is decidedly higher."""
+        return self.errors >= DECIDED and self.p_value < LEVEL
+
+    @classmethod
+    def of(cls, higher: np.ndarray, lower: np.ndarray) -> "Comparison":
+        """Compare numbers (R, M) of the seeds of two agents, which played the same M levels, by Welch's t-test.
+
+        The variance of the difference has a part of each agent's seeds, and one of the levels' differences.
+        """
+        levels = higher.mean(0) - lower.mean(0)  # (M,)
+        parts = [evaluate.seed_variance(higher), evaluate.seed_variance(lower), evaluate.level_variance(levels)]
+        freedom = [len(higher) - 1, len(lower) - 1, max(len(levels) - 1, 1)]
+        difference, variance = levels.mean(), sum(parts)
+        if not variance:
+            return cls(math.copysign(math.inf, difference), 0.0) if difference else cls(0.0, 1.0)
+        errors = difference / math.sqrt(variance)
+        of_all = variance**2 / sum(part**2 / each for part, each in zip(parts, freedom, strict=True))
+        return cls(errors, 2 * scipy.stats.t.sf(abs(errors), of_all))
+
+
 # ---- ONE TASK ----
 def table(task: Task, agents: evaluate.Runs) -> str:
     """Return a task's table, a row for each agent that has runs, and below it what these took and on which machines."""
@@ -73,24 +104,25 @@ def table(task: Task, agents: evaluate.Runs) -> str:
     hours = sum(run.seconds("iteration").sum() for run in every_run) / 3600
     machines = "; ".join(dict.fromkeys(run.machine for run in every_run))
     metric = () if task.score == task.metric else (task.metric,)
-    taken = ("largest drop", "minutes to 0.5 of the best", "minutes to 0.9", "minutes")
+    taken = ("ahead of", "largest drop", "minutes to 0.5 of the best", "minutes to 0.9", "minutes")
     header = ("agent", "mean", "IQM", "each seed", *metric, *taken)
     lines = [
         f"{task.score} after {int(every_run[0].args['total_timesteps']):,} steps\n",
         f"| {' | '.join(header)} |",
-        f"|{'|'.join('---' if name in ('agent', 'each seed') else '---:' for name in header)}|",
-        *(row(agent, runs, task, best) for agent, runs in runs_of.items()),
+        f"|{'|'.join('---' if name in ('agent', 'each seed', 'ahead of') else '---:' for name in header)}|",
+        *(row(agent, runs_of, task, best) for agent in runs_of),
         f"\nRuns: {len(every_run)}, together {hours:.1f} hours without evaluations. Machines: {machines}",
     ]
     return "\n".join(lines)
 
 
-def row(agent: str, runs: list[evaluate.RunLog], task: Task, best: float) -> str:
-    """Return the agent's row: its score, that of each seed, the largest drop, and the minutes to 0.5 and 0.9 of `best`.
+def row(agent: str, runs_of: evaluate.Runs, task: Task, best: float) -> str:
+    """Return the agent's row: its score, that of each seed, which agents it is ahead of, and how it learned.
 
-    Drops and minutes are those of the curve on development levels. A drop is how far a seed's mean is below an earlier
-    one. If the task's score is not its metric, the mean of the metric stands behind the score.
+    That is the largest drop, how far a seed's mean is below an earlier one, and the minutes to 0.5 and 0.9 of `best`,
+    all on development levels. If the task's score is not its metric, the mean of the metric stands behind the score.
     """
+    runs = runs_of[agent]
     scores = final_scores(task.score, runs)  # (R, M, E)
     steps, curve = evaluate.align([run.curves[f"eval/{task.score}"] for run in runs])  # (P,), (P, R, M, E)
     minutes = 60 * np.mean([run.hours(steps) for run in runs], 0)  # (P,)
@@ -100,11 +132,19 @@ def row(agent: str, runs: list[evaluate.RunLog], task: Task, best: float) -> str
     cells.append(", ".join(f"{mean:.2f}" for mean in scores.mean((1, 2))))
     if task.score != task.metric:
         cells.append(f"{final_scores(task.metric, runs).mean():.2f}")
+    cells.append(", ".join(other for other in runs_of if is_ahead(scores, final_scores(task.score, runs_of[other]))))
     cells.append(f"{drop:.2f}")
     for share in (0.5, 0.9):
         there = np.flatnonzero(means.mean(1) >= share * best)
         cells.append(f"{minutes[there[0]]:.1f}" if there.size and best else "")
     return f"| {' | '.join(cells)} | {minutes[-1]:.1f} |"
+
+
+def is_ahead(scores: np.ndarray, others: np.ndarray) -> bool:
+    """Return whether scores (R, M, E) are decidedly higher than others on the same levels; of one seed, never."""
+    if min(len(scores), len(others)) < 2 or scores.shape[1] != others.shape[1]:
+        return False
+    return Comparison.of(scores.mean(2), others.mean(2)).is_ahead
 
 
 # ---- ALL TASKS ----
@@ -148,8 +188,8 @@ def aggregate(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds]) -> str
     After Agarwal et al. (2021), "Deep Reinforcement Learning at the Edge of the Statistical Precipice". A seed's mean
     is normalized so that 0 is that of random actions and 1 the best (`best_of`); the IQM is over all tasks and seeds.
     The probability is that one seed is better than one of the rival's, averaged over tasks. Intervals, of 95 %, are
-    those of a bootstrap that draws seeds for each task by itself. Only tasks count that have bounds, and agents that
-    have the same number of seeds in all of them; "" if there are no two tasks or agents.
+    those of a bootstrap that draws seeds for each task by itself. Only tasks that have bounds count. Return "" if they
+    are less than two, or not all agents have equally many seeds in all of them.
     """
     tasks = {name: agents for name, agents in tasks.items() if name in bounds}
     counts = {len(runs) for agents in tasks.values() for runs in agents.values()}
@@ -162,11 +202,8 @@ def aggregate(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds]) -> str
         means = np.array([final_scores(TASKS[name].score, runs).mean((1, 2)) for runs in agents.values()])
         normalized[:, i] = (means - low) / (high - low)
     seeds = normalized.shape[-1]
-    rng = np.random.default_rng(0)
-    drawn = [rng.integers(seeds, size=(evaluate.RESAMPLES, len(tasks), seeds)) for _ in names]
-    resampled = np.stack(  # (agents, B, T, R)
-        [np.take_along_axis(scores[None], which, -1) for scores, which in zip(normalized, drawn, strict=True)]
-    )
+    drawn = np.random.default_rng(0).integers(seeds, size=(len(names), evaluate.RESAMPLES, len(tasks), seeds))
+    resampled = np.take_along_axis(normalized[:, None], drawn, -1)  # (agents, B, T, R)
 
     def cell(value: np.ndarray, values: np.ndarray) -> str:
         low, high = np.percentile(values, [2.5, 97.5])

@@ -75,10 +75,10 @@ def test_standard_error_by_hand():
 
 
 def test_standard_error_is_that_of_repeated_experiments():
-    """The deviation of the mean over experiments, each with its own seeds and levels, which add up here."""
+    """The deviation of the mean over experiments, each with its own seeds and levels."""
     rng = np.random.default_rng(0)
     seeds, levels = rng.normal(0, 2, (4000, 3, 1, 1)), rng.normal(0, 5, (4000, 1, 50, 1))
-    experiments = seeds + levels
+    experiments = seeds + levels + rng.normal(0, 6, (4000, 3, 50, 1))  # what a seed does on one level alone
     errors = [evaluate.standard_error(each) ** 2 for each in experiments]
     assert np.mean(errors) == pytest.approx(experiments.mean((1, 2, 3)).var(), rel=0.05)
 

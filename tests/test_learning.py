@@ -105,6 +105,14 @@ def test_leftovers_among_the_results_are_no_runs(tmp_path):
     assert learning.result_of(learning.Config(results=tmp_path), plan) is None
 
 
+def test_agents_to_draw_and_names_are_checked():
+    with pytest.raises(SystemExit, match="there is no 'LSTM'; there are GRU; TrXL"):
+        learning.main(learning.Config(agents=("GRU", "TrXL"), draw=("LSTM",)))
+    wide = "TrXL --trxl-dim 96 --trxl-memory-length 256 --init-lr 5e-4"
+    with pytest.raises(SystemExit, match="two of these agents have the same name in tables: TrXL, TrXL"):
+        learning.main(learning.Config(agents=("TrXL", wide)))
+
+
 def test_an_agent_goes_on_with_no_other_run(tmp_path):
     with pytest.raises(SystemExit, match="GRU --resume nowhere: --resume nowhere: there is no checkpoint"):
         learning.plan(learning.Config(), learning.TASKS["mortar-mayhem"], "GRU --resume nowhere", 1)
@@ -218,16 +226,19 @@ def test_a_run_is_complete_when_no_iteration_is_left(total, last, complete):
     assert learning.is_complete(evaluate.RunLog("run", args, seconds)) == complete
 
 
-@pytest.mark.parametrize("last", [None, 64])
-def test_a_run_without_a_score_at_its_end_is_no_result(last, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("last", "tested"), [(None, True), (64, True), ("end", False)])
+def test_a_run_without_a_score_at_its_end_is_no_result(last, tested, tmp_path, monkeypatch):
+    """It has none, or only one of an earlier evaluation, or none on the test levels."""
     config = learning.Config(folder=tmp_path, results=tmp_path)
     plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", 1)
     end = plan.args.total_timesteps // 4096 * 4096
     curves = {name: (np.array([end]), np.ones((1, 1, 1))) for name in evaluate.SECONDS.values()}
-    if last is not None:  # an earlier evaluation had one
-        curves["eval/commands_completed"] = np.array([last]), np.ones((1, 1, 1))
+    if last is not None:
+        curves["eval/commands_completed"] = np.array([end if last == "end" else last]), np.ones((1, 1, 1))
     run = evaluate.RunLog("run", plan.logged_args(), curves)
     monkeypatch.setattr(learning, "runs_in", lambda place, plan: [run])
+    test = {"test/commands_completed": ([end], np.ones((1, 5, 1)))} if tested else {}
+    monkeypatch.setattr(learning, "test_scores", lambda *_: test)
     with pytest.raises(SystemExit, match=r"GRU on .*, has no commands_completed at its end: an evaluation was cut"):
         learning.write_result(config, plan)
     assert not list(tmp_path.iterdir())

@@ -17,7 +17,7 @@ def test_a_frame_for_each_step(tmp_path, capsys):
         for frame in range(picture.n_frames):
             picture.seek(frame)
             durations.append(picture.info["duration"])
-        assert picture.size == (2 * 252 + 8, 252 + 44)
+        assert picture.size == (2 * 336 + 8, 336 + 44)
     # Steps in which nothing moves are one longer frame; the first frame is before the first step.
     assert sum(durations) == (steps + moving_picture.LAST) * moving_picture.MILLISECONDS
 

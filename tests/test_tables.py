@@ -27,12 +27,13 @@ def run_with(*means, metric="eval/coins_collected"):
 
 def test_a_row_of_the_table():
     task, fallen = TASKS["Endless-SearingSpotlights-v0"], run_with(7, 3, 8)  # it fell from 7 to 3
-    row = tables.row("GRU", [run_with(2, 9, 10), fallen], task, best=6.0)
+    runs = {"GRU": [run_with(2, 9, 10), fallen], "LSTM": [fallen], "TrXL": [run_with(0, 0, 0)]}
+    row = tables.row("GRU", runs, task, best=6.0)
     # The seeds' means, 10 and 8, have a standard error of 1; all levels are equal.
-    assert row == "| GRU | 9.00 ± 1.00 | 9.00 | 10.00, 8.00 | 4.00 | 1.0 | 2.0 | 3.0 |"
-    assert " | 4.00 | 2.0 |  | 3.0 |" in tables.row("GRU", [run_with(2, 9, 10), fallen], task, best=12.0)
-    assert "| 8.00 | 8.00 | 8.00 |" in tables.row("GRU", [fallen], task, best=12.0)
-    assert "| 0.00 |  |  | 3.0 |" in tables.row("GRU", [run_with(0, 0, 0)], task, best=0.0)
+    assert row == "| GRU | 9.00 ± 1.00 | 9.00 | 10.00, 8.00 |  | 4.00 | 1.0 | 2.0 | 3.0 |"
+    assert " | 4.00 | 2.0 |  | 3.0 |" in tables.row("GRU", runs, task, best=12.0)
+    assert "| 8.00 | 8.00 | 8.00 |" in tables.row("LSTM", runs, task, best=12.0)
+    assert "| 0.00 |  |  | 3.0 |" in tables.row("TrXL", runs, task, best=0.0)
 
 
 def test_scores_are_those_on_test_levels_where_all_runs_have_them():
@@ -42,8 +43,8 @@ def test_scores_are_those_on_test_levels_where_all_runs_have_them():
     assert tables.final_scores(task.score, runs).mean() == 4
     runs[1].curves["test/coins_collected"] = [300], np.full((1, 7, 1), 1.0)
     assert tables.final_scores(task.score, runs).shape == (2, 7, 1)
-    row = tables.row("GRU", runs, task, best=4.0)
-    assert row == "| GRU | 1.50 ± 0.50 | 1.50 | 2.00, 1.00 | 0.00 | 2.0 | 3.0 | 3.0 |"
+    row = tables.row("GRU", {"GRU": runs}, task, best=4.0)
+    assert row == "| GRU | 1.50 ± 0.50 | 1.50 | 2.00, 1.00 |  | 0.00 | 2.0 | 3.0 | 3.0 |"
 
 
 def test_agents_of_finite_mortar_mayhem_are_compared_by_what_they_carried_out():
@@ -53,8 +54,8 @@ def test_agents_of_finite_mortar_mayhem_are_compared_by_what_they_carried_out():
     for run, shares in ((slow, (0.25, 0.25, 0.75)), (fast, (0.25, 1, 1))):
         run.curves["eval/carried_out"] = run_with(*shares).curves["eval/coins_collected"]
     table = tables.table(task, {"slow": [slow], "fast": [fast]}).splitlines()
-    assert "| slow | 0.75 | 0.75 | 0.75 | 1.00 | 0.00 | 3.0 |  | 3.0 |" in table
-    assert "| fast | 1.00 | 1.00 | 1.00 | 1.00 | 0.00 | 2.0 | 2.0 | 3.0 |" in table
+    assert "| slow | 0.75 | 0.75 | 0.75 | 1.00 |  | 0.00 | 3.0 |  | 3.0 |" in table
+    assert "| fast | 1.00 | 1.00 | 1.00 | 1.00 |  | 0.00 | 2.0 | 2.0 | 3.0 |" in table
 
 
 def test_a_table_leaves_out_agents_without_runs_and_compares_with_the_best():
@@ -122,6 +123,20 @@ def test_tasks_that_lack_something_are_not_taken_together(lacking):
     assert tables.aggregate(tasks, bounds) == ""
 
 
+def test_an_agent_is_ahead_if_the_difference_is_decided():
+    """9.1 is above 8 by 1.9 standard errors, then by 8.5; all levels are equal."""
+    task = TASKS["Endless-SearingSpotlights-v0"]
+    runs = {
+        "GRU": [run_with(0, 0, last) for last in (9, 9.1, 9.2)],
+        "LSTM": [run_with(0, 0, last) for last in (8, 9, 7)],
+    }
+    gru, lstm = (line.split(" | ") for line in tables.table(task, runs).splitlines()[4:6])
+    assert (gru[4], lstm[4]) == ("", "")
+    runs["LSTM"] = [run_with(0, 0, last) for last in (8, 8.2, 7.8)]
+    gru, lstm = (line.split(" | ") for line in tables.table(task, runs).splitlines()[4:6])
+    assert (gru[4], lstm[4]) == ("LSTM", "")
+
+
 def test_how_probably_a_seed_is_better():
     ours = np.array([[1.0, 2.0], [0.0, 0.0]])  # in the first task 1 of 4 pairs is won and 1 is even, then all are lost
     theirs = np.array([[2.0, 2.0], [1.0, 1.0]])
@@ -152,7 +167,7 @@ def test_a_picture(tmp_path, monkeypatch):
 
 
 def test_agents_of_the_suites_have_colors():
-    names = {name.partition(",")[0] for _, agents in SUITES.values() for name in map(short, agents)}
+    names = {short(agent) for _, agents in SUITES.values() for agent in agents}
     assert names == set(COLORS)
 
 
@@ -179,5 +194,8 @@ def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_pa
     lines = [line for line in text.splitlines() if line.startswith("|")]
     assert len(lines) > 30
     assert [line for line in lines if line not in printed.splitlines()] == []
-    numbers = set(re.findall(r"(?<![\d.])\d+\.\d+(?![\d.])", text.replace("section 6.3", "")))
+    numbers = set(re.findall(r"(?<![\d.])\d+\.\d+(?![\d.])", text.replace("p < 0.05", "").replace("section 6.3", "")))
     assert numbers <= set(re.findall(r"\d+\.\d+", printed))
+    scores = re.findall(r"\d+\.\d+ ± \d+\.\d+", (ROOT / "README.md").read_text())
+    assert len(scores) > 10
+    assert [score for score in scores if score not in printed] == []
