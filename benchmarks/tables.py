@@ -46,8 +46,13 @@ def final_scores(name: str, runs: list[evaluate.RunLog]) -> np.ndarray:
 
     They are those on the test levels, or where a run has none, on the development levels.
     """
-    levels = "test" if all(f"test/{name}" in run.curves for run in runs) else "eval"
+    levels = "test" if are_tested(name, runs) else "eval"
     return evaluate.align([run.curves[f"{levels}/{name}"] for run in runs])[1][-1]
+
+
+def are_tested(name: str, runs: list[evaluate.RunLog]) -> bool:
+    """Return whether all of the seeds have the metric or score on the test levels."""
+    return all(f"test/{name}" in run.curves for run in runs)
 
 
 def mean_and_error(scores: np.ndarray) -> str:
@@ -113,6 +118,9 @@ def table(task: Task, agents: evaluate.Runs) -> str:
         *(row(agent, runs_of, task, best) for agent in runs_of),
         f"\nRuns: {len(every_run)}, together {hours:.1f} hours without evaluations. Machines: {machines}",
     ]
+    untested = [agent for agent, runs in runs_of.items() if not are_tested(task.score, runs)]
+    if 0 < len(untested) < len(runs_of):
+        lines.append(f"On development levels, so not comparable with the others: {', '.join(untested)}")
     return "\n".join(lines)
 
 

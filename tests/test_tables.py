@@ -45,6 +45,10 @@ def test_scores_are_those_on_test_levels_where_all_runs_have_them():
     assert tables.final_scores(task.score, runs).shape == (2, 7, 1)
     row = tables.row("GRU", {"GRU": runs}, task, best=4.0)
     assert row == "| GRU | 1.50 ± 0.50 | 1.50 | 2.00, 1.00 |  | 0.00 | 2.0 | 3.0 | 3.0 |"
+    others = [run_with(0, 0, 1), run_with(0, 0, 1.1)]
+    *_, note = tables.table(task, {"GRU": runs, "LSTM": others}).splitlines()
+    assert note == "On development levels, so not comparable with the others: LSTM"
+    assert "On development levels" not in tables.table(task, {"LSTM": others})
 
 
 def test_agents_of_finite_mortar_mayhem_are_compared_by_what_they_carried_out():
