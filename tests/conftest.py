@@ -3,11 +3,15 @@ import os
 os.environ["OMP_NUM_THREADS"] = "1"  # of the programs that tests start, too: as many threads, to the bit the same
 
 import importlib
+import random
 from pathlib import Path
+from types import SimpleNamespace
 
 import cue_recall  # noqa: F401 (registers CueRecall-v0)
+import numpy as np
 import pytest
 import torch
+from gymnasium.utils import seeding
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.summary.writer import event_file_writer
 from tensorboard.util.tensor_util import make_ndarray
@@ -33,6 +37,16 @@ SMALL = {"hidden_size": 32, "trxl_dim": 32, "trxl_num_heads": 2, "trxl_num_layer
 def own_folder(tmp_path, monkeypatch):
     """Let every test write its runs to a folder of its own."""
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(autouse=True)
+def same_draws(monkeypatch):
+    """Let what a test draws without a seed be the same in every run of the tests."""
+    torch.manual_seed(0)
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002 (environments of others draw from it)
+    seeded = SimpleNamespace(np_random=lambda seed=None: seeding.np_random(0 if seed is None else seed))
+    monkeypatch.setattr("gymnasium.spaces.space.seeding", seeded)
 
 
 def parse_args(script, *flags):
