@@ -81,8 +81,8 @@ class Config(Training):
     """What to train and to draw."""
 
     suite: Literal["small", "full", "laptop"] = "small"
-    """tasks that are learned within minutes, the ten environments with their default options, or these with the agents
-    that --preset laptop trains"""
+    """tasks that are learned within minutes, the ten environments with their default options, or some of these with the
+    agents that --preset laptop trains"""
     tasks: tuple[str, ...] = ()
     """other tasks than the suite's, of those that this program knows"""
     agents: tuple[str, ...] = ()
@@ -383,7 +383,7 @@ def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"there is no {unknown[0]!r}; there are {'; '.join(known)}")
     return {
-        (task, name, seed): plan(config, TASKS[task], agent, seed)
+        (task, name, seed): plan(config, suite_tasks.get(task, TASKS[task]), agent, seed)
         for task in tasks
         for seed in config.seeds
         for name, agent in agents.items()
@@ -434,8 +434,8 @@ def main(config: Config) -> None:
     found = {name: agents for name, agents in tasks.items() if any(agents.values())}
     if not found:
         raise SystemExit(f"{config.results} has no results of these agents; without --report they are trained")
-    bounds = tables.read_bounds()
-    for text in (tables.overview(found, bounds), tables.aggregate(found, bounds)):
+    bounds, thesis = tables.read_bounds(), tables.read_thesis()
+    for text in (tables.overview(found, bounds, thesis), tables.aggregate(found, bounds)):
         print(f"{text}\n" if text else "")
     for name, agents in found.items():
         print(f"## {TASKS[name].title}\n\n{tables.table(TASKS[name], agents)}\n")

@@ -21,7 +21,7 @@ from matplotlib.ticker import EngFormatter
 import evaluate
 from suites import COLORS, TASKS, Task
 
-BOUNDS = Path(__file__).with_name("bounds.csv")
+BOUNDS, THESIS = (Path(__file__).with_name(name) for name in ("bounds.csv", "thesis.csv"))
 DECIDED, LEVEL = 2.0, 0.05  # agents differ by so many standard errors of the difference, and with a p-value below that
 RIVALS = ("no memory", "GRU")  # with which the others are compared over all tasks
 NAMES_APART = 0.075  # between the names at the curves' ends, as a share of the axis
@@ -39,6 +39,12 @@ def read_bounds(path: Path = BOUNDS) -> dict[str, Bounds]:
     """Read what benchmarks/bounds.py wrote, by task."""
     with path.open(newline="") as file:
         return {row["task"]: Bounds(float(row["random"]), float(row["scripted"])) for row in csv.DictReader(file)}
+
+
+def read_thesis(path: Path = THESIS) -> dict[str, str]:
+    """Read the interquartile means of GRU and TrXL that the thesis' text has, by task; a question mark for none."""
+    with path.open(newline="") as file:
+        return {row["task"]: ", ".join(row[agent] or "?" for agent in ("GRU", "TrXL")) for row in csv.DictReader(file)}
 
 
 def final_scores(name: str, runs: list[evaluate.RunLog]) -> np.ndarray:
@@ -156,12 +162,12 @@ def is_ahead(scores: np.ndarray, others: np.ndarray) -> bool:
 
 
 # ---- ALL TASKS ----
-def overview(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds]) -> str:
+def overview(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds], thesis: dict[str, str]) -> str:
     """Return a table with a row for each task: the mean score of each agent's final weights, and its standard error.
 
-    Beside it stand the scores of random actions and of the scripted player, the steps of a training, and the minutes of
-    the fastest and of the slowest agent. Where an agent has fewer seeds than others, it says how many; where it has
-    none, there is no number.
+    Beside it stand the scores of random actions, of the scripted player and in the thesis, the steps of a training, and
+    the minutes of the fastest and of the slowest agent. Where an agent has fewer seeds than others, it says how many;
+    where it has none, there is no number.
     """
     names = [*dict.fromkeys(agent for agents in tasks.values() for agent in agents)]
     most = max(len(runs) for agents in tasks.values() for runs in agents.values())
@@ -172,7 +178,8 @@ def overview(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds]) -> str:
         few = f", {len(runs)} seed{'s' * (len(runs) > 1)}" if len(runs) < most else ""
         return mean_and_error(final_scores(task.score, runs)) + few
 
-    header = ["task, score", "steps", "random", *names, "scripted", "minutes"]
+    theirs = ["thesis: GRU, TrXL"] if tasks.keys() & thesis.keys() else []
+    header = ["task, score", "steps", "random", *names, "scripted", *theirs, "minutes"]
     lines = [f"| {' | '.join(header)} |", f"|---|{'---:|' * (len(header) - 1)}"]
     for name, agents in tasks.items():
         first = next(runs[0] for runs in agents.values() if runs)
@@ -184,6 +191,7 @@ def overview(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds]) -> str:
             f"{known.random:.2f}" if known else "",
             *(cell(TASKS[name], agents.get(agent, [])) for agent in names),
             f"{known.scripted:.2f}" if known else "",
+            *[thesis.get(name, "") for _ in theirs],
             f"{min(minutes):.0f} to {max(minutes):.0f}",
         ]
         lines.append(f"| {' | '.join(cells)} |")
@@ -217,7 +225,7 @@ def aggregate(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds]) -> str
         low, high = np.percentile(values, [2.5, 97.5])
         return f"{float(value):.2f} ({low:.2f} to {high:.2f})"
 
-    rivals = [rival for rival in RIVALS if rival in names]
+    rivals = [name for rival in RIVALS for name in names if name.removesuffix(", Muon") == rival]
     header = ["agent", "normalized IQM", *(f"better than {rival}" for rival in rivals)]
     lines = [f"| {' | '.join(header)} |", f"|---|{'---:|' * (len(header) - 1)}"]
     for name, scores, resamples in zip(names, normalized, resampled, strict=True):

@@ -23,6 +23,7 @@ import torch
 import tyro
 from torch.distributed import run as torchrun
 
+import evaluate
 import learning
 import memory_gym_envs  # noqa: F401 (registers the ids)
 import ppo_gru
@@ -290,3 +291,22 @@ def test_page_plays_an_agent(monkeypatch, capsys):
 @each_page
 def test_nothing_is_left_open(page):
     assert "TODO" not in page.read_text()
+
+
+def test_what_an_episode_ends_with():
+    """The page's table has all numbers of an info but reward and length, and the ground truth's shape."""
+    page = (ROOT / "docs/environments.md").read_text()
+    rows = re.findall(r"^  \| [\w ]+ \| \((\d),\): .*? \| (.*) \|$", page, re.MULTILINE)
+    families = ("MortarMayhem", "MysteryPath", "SearingSpotlights")
+    ids = [f"{kind}{family}-v0" for family in families for kind in ("", "Endless-")]
+    for env_id, (size, text) in zip(ids, rows, strict=True):
+        env = gym.make(env_id, obs_type="vector")
+        env.reset(seed=0)
+        is_over = False
+        while not is_over:
+            *_, terminated, truncated, info = env.step(env.action_space.sample())
+            is_over = terminated or truncated
+        assert info["ground_truth"].shape == (int(size),)
+        keys = re.findall(r"`(\w+)`", text)
+        assert {*keys, "reward", "length", "ground_truth"} == set(info)
+        assert keys[0] == evaluate.own_metric(env_id).replace("return", "reward")

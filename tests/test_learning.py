@@ -333,3 +333,13 @@ def test_the_full_suite():
     assert len(tasks) == 10
     assert [(name, task.env_id, task.options) for name, task in tasks.items()] == [(i, i, {}) for i in tasks]
     assert len(agents) == len(set(agents)) == 9
+
+
+def test_the_laptop_suite_has_budgets_of_its_own():
+    task = "Endless-MortarMayhem-v0"
+    of_suites = {}
+    for suite in ("laptop", "full"):
+        config = learning.Config(suite=suite, tasks=(task,), agents=("GRU, Muon",), seeds=(1,))
+        (plan,) = learning.plans_of(config).values()
+        of_suites[suite] = plan.args.total_timesteps
+    assert of_suites == {"laptop": 3_000_000, "full": 6_000_000}

@@ -12,6 +12,7 @@ import tyro
 import evaluate
 import learning
 import tables
+import tuning
 from suites import COLORS, SUITES, TASKS, short
 
 ROOT = Path(__file__).parents[1]
@@ -83,11 +84,12 @@ def test_an_overview_says_where_seeds_or_agents_are_missing():
         "Endless-MortarMayhem-v0": {"GRU": [commands] * 2, "LSTM": []},
     }
     bounds = {"SearingSpotlights-v0": tables.Bounds(0.01, 0.9)}
-    assert tables.overview(tasks, bounds).splitlines() == [
-        "| task, score | steps | random | GRU | LSTM | scripted | minutes |",
-        "|---|---:|---:|---:|---:|---:|---:|",
-        "| SearingSpotlights-v0, success | 0.0003 M | 0.01 | 0.25 ± 0.00 | 0.25, 1 seed | 0.90 | 3 to 3 |",
-        "| Endless-MortarMayhem-v0, commands_completed | 0.0003 M |  | 2.00 ± 0.00, 2 seeds |  |  | 3 to 3 |",
+    thesis = {"Endless-MortarMayhem-v0": "120, 18"}
+    assert tables.overview(tasks, bounds, thesis).splitlines() == [
+        "| task, score | steps | random | GRU | LSTM | scripted | thesis: GRU, TrXL | minutes |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|",
+        "| SearingSpotlights-v0, success | 0.0003 M | 0.01 | 0.25 ± 0.00 | 0.25, 1 seed | 0.90 |  | 3 to 3 |",
+        "| Endless-MortarMayhem-v0, commands_completed | 0.0003 M |  | 2.00 ± 0.00, 2 seeds |  |  | 120, 18 | 3 to 3 |",
     ]
 
 
@@ -184,6 +186,11 @@ def test_bounds_are_those_of_the_ten_tasks():
             assert each.scripted <= TASKS[name].best_score
 
 
+def test_what_the_thesis_reports_is_of_the_ten_tasks():
+    assert set(tables.read_thesis()) <= set(SUITES["full"][0])
+    assert tables.read_thesis()["MortarMayhem-v0"] == "0.6, ?"
+
+
 def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_path, monkeypatch, capsys):
     """All scores with a decimal point, and all tables as they are."""
     monkeypatch.chdir(ROOT)
@@ -203,3 +210,26 @@ def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_pa
     scores = re.findall(r"\d+\.\d+ ± \d+\.\d+", (ROOT / "README.md").read_text())
     assert len(scores) > 10
     assert [score for score in scores if score not in printed] == []
+
+
+def test_the_table_of_minutes_is_printed_by_its_command(capsys):
+    tuning.main(tuning.Config())
+    assert capsys.readouterr().out in (ROOT / "docs/tuning.md").read_text()
+
+
+def test_speeds_are_measured(tmp_path, monkeypatch):
+    """Of all agents, in turn; here with trainings of an iteration."""
+    monkeypatch.setattr(tuning, "SPEEDS", tmp_path / "speeds.csv")
+    monkeypatch.setattr(tuning, "STEPS", 256)
+    monkeypatch.setattr(tuning, "LAPTOP", ["MortarMayhem-Grid-v0"])
+    small = " --num-envs 4 --num-steps 32 --num-minibatches 2"
+    monkeypatch.setattr(
+        tuning, "AGENTS", {key: (suite, agent + small) for key, (suite, agent) in tuning.AGENTS.items()}
+    )
+    tuning.measure_speeds()
+    head, *rows = (tmp_path / "speeds.csv").read_text().splitlines()
+    assert head == "task,script,preset,steps_per_second"
+    assert [row.rpartition(",")[0] for row in rows] == [
+        f"MortarMayhem-Grid-v0,{','.join(key)}" for key in tuning.AGENTS
+    ]
+    assert all(int(row.rpartition(",")[2]) > 0 for row in rows)

@@ -1,0 +1,107 @@
+"""How many steps and minutes today's preset takes, beside the one before: the table of docs/tuning.md.
+
+    python benchmarks/tuning.py
+
+Scores are those of benchmarks/results on development levels. Speeds are those of benchmarks/steps_per_second.csv, which
+--measure writes: short trainings in turn, for which the machine has to have nothing else to do.
+"""
+
+import csv
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
+
+import evaluate
+import learning
+import tables
+from suites import LAPTOP, TASKS, WIDE
+
+RESULTS, SPEEDS = (Path(__file__).with_name(name) for name in ("results", "steps_per_second.csv"))
+AGENTS = {  # by script and preset: the suite and the agent
+    ("ppo_trxl.py", "AdamW"): ("full", f"TrXL, preset {WIDE}"),
+    ("ppo_trxl.py", "Muon"): ("laptop", "TrXL, Muon"),
+    ("ppo_gru.py", "AdamW"): ("full", "GRU"),
+    ("ppo_gru.py", "Muon"): ("laptop", "GRU, Muon"),
+}
+STEPS = 81_920  # of a training that is measured
+
+
+@dataclass
+class Config:
+    """What to do before the table is printed."""
+
+    measure: bool = False
+    """measure the steps per second of this machine, which takes some minutes"""
+
+
+def plans_of(task: str, suite: str, agent: str) -> dict[tuple[str, str, int], learning.Plan]:
+    """Return the trainings of an agent, one a seed."""
+    return learning.plans_of(learning.Config(suite=suite, tasks=(task,), agents=(agent,), results=RESULTS))
+
+
+def measure_speeds() -> None:
+    """Train for a few iterations with each script and preset in turn, on one core, and write their steps per second."""
+    with SPEEDS.open("w", newline="") as file, tempfile.TemporaryDirectory() as folder:
+        writer = csv.writer(file)
+        writer.writerow(("task", "script", "preset", "steps_per_second"))
+        for task in LAPTOP:
+            for (script, preset), (suite, agent) in AGENTS.items():
+                plan = next(iter(plans_of(task, suite, agent).values()))
+                flags = ["--no-save-model", "--eval-interval", "0", "--total-timesteps", str(STEPS)]
+                env = {**os.environ, "OMP_NUM_THREADS": "1"}
+                subprocess.run([*plan.command, *flags], check=True, cwd=folder, env=env, capture_output=True)
+                (run,) = (Path(folder) / "runs").iterdir()
+                speed = evaluate.read_run(str(run)).curves["charts/SPS"][1][-1].item()
+                run.rename(Path(folder) / f"{task}-{script}-{preset}")
+                writer.writerow((task, script, preset, round(speed)))
+                file.flush()
+
+
+def table(speeds: dict[tuple[str, str, str], float]) -> str:
+    """Return a row for each task, script and preset: score, steps to 0.5 and 0.9 of the best, and minutes.
+
+    The best is the best possible score, or where there is no bound the highest mean of these agents. Minutes are those
+    of all steps at the measured steps per second.
+    """
+    lines = ["| task | script | preset | steps | score | steps to 0.5 | steps to 0.9 | steps/s | minutes |"]
+    lines.append("|---|---|---|---:|---:|---:|---:|---:|---:|")
+    for name in dict.fromkeys(task for task, _, _ in speeds):
+        runs_of = {
+            key: learning.results_of(learning.Config(results=RESULTS), plans_of(name, *agent))[name].popitem()[1]
+            for key, agent in AGENTS.items()
+        }
+        task = TASKS[name]
+        curves = {
+            key: evaluate.align([run.curves[f"eval/{task.score}"] for run in runs]) for key, runs in runs_of.items()
+        }
+        best = task.best_score or max(scores[-1].mean() for _, scores in curves.values())
+        for (script, preset), (steps, scores) in curves.items():  # (P,), (P, R, M, E)
+            total = int(runs_of[script, preset][0].args["total_timesteps"])
+            speed = speeds[name, script, preset]
+            cells = [name, f"`{script}`", preset, f"{total / 1e6:g} M", tables.mean_and_error(scores[-1])]
+            for share in (0.5, 0.9):
+                there = np.flatnonzero(scores.mean((1, 2, 3)) >= share * best)
+                cells.append(f"{steps[there[0]] / 1e6:.2f} M" if there.size else "")
+            lines.append(f"| {' | '.join(cells)} | {speed:,.0f} | {total / speed / 60:.1f} |")
+    return "\n".join(lines)
+
+
+def main(config: Config) -> None:
+    """Print the table."""
+    if config.measure:
+        measure_speeds()
+    with SPEEDS.open(newline="") as file:
+        rows = [*csv.DictReader(file)]
+    print(table({(row["task"], row["script"], row["preset"]): float(row["steps_per_second"]) for row in rows}))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
