@@ -6,15 +6,14 @@
 Tasks, runs and results are those of benchmarks/learning.py: small networks, vector observations, minutes of training.
 
 A claim compares pairs of agents: each that is said to have the higher number with each that is said to have the lower
-one. A pair is decided if the means differ by at least two standard errors of their difference, over seeds and levels.
-The claim holds if all of its pairs are decided its way, does not hold if one is decided the other way, and else is not
+one. A pair is decided as in the tables of results (`tables.Comparison`): by Welch's t-test over seeds and levels. The
+claim holds if all of its pairs are decided its way, does not hold if one is decided the other way, and else is not
 decided. Where the thesis says that agents are no better than others, that is contradicted if a pair is decided. Where
 no agent of a row scores higher than those without memory, the task has not been learned, and there is no verdict.
 
 With so many rows, some verdicts come by chance. A star marks those that also stand at a family-wise error of 5 % (Holm,
-1979), by Student's t-distribution with as many degrees of freedom as the pair's seeds leave, four with three each. A
-row of several pairs has the largest of their p-values where all of them are needed, else the smallest times their
-number.
+1979). A row of several pairs has the largest of their p-values where all of them are needed, else the smallest times
+their number.
 
 With --report nothing is trained, and a claim is not tested if runs are missing.
 """
@@ -37,7 +36,7 @@ import learning
 import suites
 import tables
 from suites import Task
-from tables import DECIDED, LEVEL, Comparison
+from tables import LEVEL, Comparison
 
 IN_VIEW = {"command_count": [4], "explosion_delay": [4], "explosion_duration": [2]}
 ALL_VISIBLE = {"agent_visible": True, "coins_visible": True, "exit_visible": True}
@@ -51,10 +50,15 @@ TASKS = suites.TASKS | {
 WIDE_TASKS = {*suites.FULL, "endless-long"}  # here, transformers have about as many parameters as the GRU
 
 
-# What is compared, (R, M): of each seed, on each level.
+# What is compared, (R, M): of each seed, on each of the development levels, which all runs have.
+def at_the_end(name: str, runs: list[evaluate.RunLog]) -> np.ndarray:
+    """Return the scores of the final weights, by the name of a metric or score."""
+    return evaluate.align([run.curves[f"eval/{name}"] for run in runs])[1][-1].mean(-1)
+
+
 def score(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
-    """Return the scores of the final weights."""
-    return tables.final_scores(task.score, runs).mean(-1)
+    """Return the task's scores of the final weights."""
+    return at_the_end(task.score, runs)
 
 
 def area(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
@@ -64,7 +68,7 @@ def area(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
 
 def falls(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
     """Return how often the final weights fall off."""
-    return tables.final_scores("num_fails", runs).mean(-1)
+    return at_the_end("num_fails", runs)
 
 
 def gradient_norm(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
@@ -247,8 +251,8 @@ class Verdict:
 
 def verdict(claim: Claim, pairs: list[Comparison]) -> Verdict:
     """Return the verdict on a claim, from the comparisons of its pairs."""
-    above = [pair.p_value for pair in pairs if pair.errors >= DECIDED]
-    below = [pair.p_value for pair in pairs if pair.errors <= -DECIDED]
+    above = [pair.p_value for pair in pairs if pair.errors > 0]
+    below = [pair.p_value for pair in pairs if pair.errors < 0]
     # That one pair of several is decided is as likely as Bonferroni says, that all are, as the least sure one.
     if not claim.expects_difference:
         found = Verdict("contradicted", min(1, len(pairs) * min(above, default=1)))
@@ -267,17 +271,17 @@ def is_learned(claim: Claim, runs: dict[str, list[evaluate.RunLog]], without: li
 
     An agent without memory that is one of the claim's has to be passed by another.
     """
-    if not without:
+    if len(without) < 2:
         return True
     base = score(TASKS[claim.task], without)
     scores = [score(TASKS[claim.task], members) for agent, members in runs.items() if not agent.startswith("no memory")]
     return any(Comparison.of(each, base).is_ahead for each in scores)
 
 
-def holm(p_values: list[float], level: float = 0.05) -> list[bool]:
-    """Return which of these p-values stand at this family-wise error (Holm, 1979)."""
+def holm(p_values: list[float]) -> list[bool]:
+    """Return which of these p-values stand at a family-wise error of `LEVEL` (Holm, 1979)."""
     order = np.argsort(p_values)
-    limits = level / np.arange(len(order), 0, -1)
+    limits = LEVEL / np.arange(len(order), 0, -1)
     passed = np.cumprod(np.array(p_values)[order] <= limits).astype(bool)  # from the smallest to the first that fails
     return passed[np.argsort(order)].tolist()
 
