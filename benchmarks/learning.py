@@ -199,18 +199,20 @@ def result_of(config: Training, plan: Plan) -> evaluate.RunLog | None:
 
 
 def is_complete(run: evaluate.RunLog) -> bool:
-    """Return whether a run has trained for all its steps."""
+    """Return whether a run has trained for all its steps and written its final weights."""
     total, *batch = (int(run.args[name]) for name in ("total_timesteps", "num_envs", "num_steps"))
-    return run.has_seconds() and run.last_step + math.prod(batch) > total
+    is_trained = run.has_seconds() and run.last_step + math.prod(batch) > total
+    return is_trained and (Path(run.path) / "model.pt").is_file()
 
 
 def expected_hours(config: Training, missing: list[Plan]) -> str:
     """Return about how many hours the trainings take, by the results of the same scripts that are there; or nothing."""
     speeds = {}
     for path in config.results.glob("*/*.json.gz"):
-        run = evaluate.read_run(str(path))
-        if run.has_seconds():
-            speeds.setdefault(run.args["script"], []).append(run.last_step / run.seconds("iteration").sum())
+        with contextlib.suppress(evaluate.NoCurvesError):
+            run = evaluate.read_run(str(path))
+            if run.has_seconds():
+                speeds.setdefault(run.args["script"], []).append(run.last_step / run.seconds("iteration").sum())
     scripts = [Path(plan.command[1]).stem for plan in missing]
     if not {*scripts} <= {*speeds}:
         return ""
@@ -310,7 +312,10 @@ def test_scores(config: Training, plan: Plan, run: evaluate.RunLog) -> dict[str,
     if done.returncode:
         raise SystemExit(f"{plan}, could not be scored: {done.stderr.strip()}")
     (task,) = json.loads(scores.read_text())
-    metrics = task["agents"][0]["metrics"]
+    (agent,) = task["agents"]
+    if agent["steps"] != [run.last_step]:  # of a training that was stopped once, and again before it wrote its weights
+        raise SystemExit(f"{plan}, has weights of step {agent['steps'][0]}, not {run.last_step}; remove {run.path}")
+    metrics = agent["metrics"]
     return {f"test/{name}": ([run.last_step], np.array(each["scores"])) for name, each in metrics.items()}
 
 
@@ -452,7 +457,7 @@ if __name__ == "__main__":
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     try:
         main(tyro.cli(Config))
-    except OSError as error:
+    except (OSError, evaluate.NoCurvesError) as error:
         sys.exit(f"learning.py: {error}")
     except KeyboardInterrupt:
         sys.exit(130)

@@ -1,6 +1,7 @@
 """benchmarks/learning.py: its command lines, and which runs it need not train again."""
 
 import fcntl
+import json
 import os
 import re
 import shutil
@@ -219,11 +220,26 @@ def test_a_training_that_is_about_to_begin_is_stopped_too(tmp_path, monkeypatch)
 @pytest.mark.parametrize(
     ("total", "last", "complete"), [(96, 64, False), (96, 96, True), (100, 64, False), (100, 96, True)]
 )
-def test_a_run_is_complete_when_no_iteration_is_left(total, last, complete):
-    """Of 32 steps each."""
+def test_a_run_is_complete_when_no_iteration_is_left(total, last, complete, tmp_path):
+    """Of 32 steps each; and when it has written its final weights."""
     seconds = {name: (np.array([last]), np.ones((1, 1, 1))) for name in evaluate.SECONDS.values()}
     args = {"total_timesteps": str(total), "num_envs": "4", "num_steps": "8"}
-    assert learning.is_complete(evaluate.RunLog("run", args, seconds)) == complete
+    run = evaluate.RunLog(str(tmp_path), args, seconds)
+    assert not learning.is_complete(run)
+    (tmp_path / "model.pt").touch()
+    assert learning.is_complete(run) == complete
+
+
+def test_weights_of_an_earlier_step_are_not_scored(tmp_path, monkeypatch):
+    """A run was stopped, which wrote them, went on, and was killed before it wrote its last ones."""
+    agent = {"steps": [64], "metrics": {"return": {"scores": [[[1.0]]]}}}
+    (tmp_path / "test_scores.json").write_text(json.dumps([{"agents": [agent]}]))
+    monkeypatch.setattr(subprocess, "run", lambda *args, **how: subprocess.CompletedProcess(args, 0))
+    config = learning.Config(folder=tmp_path)
+    plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", 1)
+    run = evaluate.RunLog(str(tmp_path), {}, {name: (np.array([96]), np.ones(1)) for name in evaluate.SECONDS.values()})
+    with pytest.raises(SystemExit, match="has weights of step 64, not 96"):
+        learning.test_scores(config, plan, run)
 
 
 @pytest.mark.parametrize(("last", "tested"), [(None, True), (64, True), ("end", False)])
