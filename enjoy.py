@@ -87,7 +87,7 @@ class Config:
     """Play episodes of trained agents and write a page to watch them."""
 
     checkpoint: Annotated[str, tyro.conf.Positional]
-    """a file that --save-model wrote"""
+    """model.pt or a checkpoint"""
     others: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """further ones, of agents that play the same task, to compare on the same levels"""
     seed: int | None = None
@@ -359,7 +359,7 @@ def load(path: str, env_options: str | None = None) -> tuple[nn.Module, gym.vect
     args = replace(saved_args(script.Args, saved), amp=False)  # one lane is little work; not all CPUs have bfloat16
     check_draws("enjoy.py", args.env_id)
     args = with_options(args, env_options)
-    envs = envs_for(args, 1, render_mode="debug_rgb_array")
+    envs = envs_for(args, 1, render_mode="debug_rgb_array", asynchronous=False)
     _, infos = envs.reset()
     agent = make_agent(script.Agent, envs, infos, args)
     load_weights(agent, saved, path)

@@ -23,7 +23,7 @@ environments, evaluation, run folder, checkpoints, several processes, and faster
 
 Shape letters: T steps of a rollout, N environments, A action branches, B steps of a minibatch, S segments in it, L
 steps of its longest segment, W window, M keys that are attended to, K blocks, H attention heads, D width of the memory
-and of its input I, F features of the trunk, G entries of the ground truth.
+and I of its input (the same), F features of the trunk, G entries of the ground truth.
 """
 
 from __future__ import annotations
@@ -212,7 +212,6 @@ LAPTOP = {
     "obs_type": "vector",
     "trxl_num_layers": 2,
     "trxl_dim": 96,
-    "trxl_memory_length": 256,
     "trxl_query_position": True,
     "trxl_memory_gradient": True,
     "trunk_size": 128,
@@ -275,8 +274,8 @@ def train(args: Args, run: Run) -> None:
         updated = time.perf_counter()
 
         logs |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
-        seconds = {"collect": collected - began, "update": updated - collected, "iteration": updated - began}
-        logs |= {f"charts/seconds_{part}": value for part, value in seconds.items()}
+        logs |= {"charts/seconds_collect": collected - began, "charts/seconds_update": updated - collected}
+        logs |= {"charts/seconds_iteration": updated - began}
         run.step = global_step + batch_size
         end_iteration(args, run, logs, episodes)  # evaluation, TensorBoard, progress bar, checkpoint
         if run.stop:
@@ -471,7 +470,7 @@ def clip_gradients(agent: Agent, args: Args) -> Tensor:
     """
     own = {*agent.parameters()}
     for network, detached in ((agent.decoder, args.reconstruction_detach), (agent.estimator, args.ground_truth_detach)):
-        if network is not None and detached:
+        if detached:
             nn.utils.clip_grad_norm_(network.parameters(), args.max_grad_norm)
             own -= {*network.parameters()}
     return nn.utils.clip_grad_norm_([each for each in agent.parameters() if each in own], args.max_grad_norm)
@@ -517,12 +516,12 @@ def gae(rollout: Rollout, last_value: Tensor, gamma: float, gae_lambda: float) -
 
 @dataclass
 class ReturnScale:
-    """Mean and variance of the discounted return from an episode's start, of all steps (Engstrom et al., 2020).
+    """Mean and variance of the discounted sum of an episode's rewards so far, of all steps (Engstrom et al., 2020).
 
     Rewards are divided by its deviation; since no mean is subtracted, they keep their sign.
     """
 
-    discounted: Tensor  # (N,) that of the present episodes
+    discounted: Tensor  # (N,) that sum in the present episodes
     count: int = 0
     mean: float = 0.0
     variance: float = 0.0
@@ -770,7 +769,7 @@ class Memory(nn.Module):
         query = self.first_query(x, state.episode_step.to(x.device)[:, None], state.hidden[state.now - 1, :, -1:])
         hidden = [x]
         for k, block in enumerate(self.blocks):
-            # Behind the first block, a query is what goes through the block.
+            # After the first block, the query is the block's input.
             x = query = block(x, query, (state.keys[k][:, rows], state.values[k][:, rows]), age, mask)
             hidden.append(x)
         return x[:, 0], torch.cat(hidden, 1)
@@ -857,11 +856,9 @@ class Memory(nn.Module):
             return self.table[episode_step.clamp(max=len(self.table) - 1)]
         return sinusoid(episode_step, self.width).to(dtype)
 
-    def position(self, episode_step: Tensor, dtype: torch.dtype) -> Tensor:
-        """Return what is added to hidden states of these steps (...): their encoding (..., D), or a zero."""
-        if self.encoding in ("absolute", "learned"):
-            return self.encode_step(episode_step, dtype)
-        return torch.zeros((), dtype=dtype, device=episode_step.device)
+    def position(self, episode_step: Tensor, dtype: torch.dtype) -> Tensor | float:
+        """Return what is added to hidden states of these steps (...): their encoding (..., D), or 0."""
+        return self.encode_step(episode_step, dtype) if self.encoding in ("absolute", "learned") else 0.0
 
     def first_query(self, x: Tensor, episode_step: Tensor, previous_output: Tensor) -> Tensor:
         """Return x (S, L, D), and added to it the encoding of episode_step (S, L) and the previous output (§7.1.3)."""
@@ -1026,9 +1023,9 @@ class AtariCNN(nn.Sequential):
         self.to(memory_format=torch.channels_last)  # the order in which the environments deliver pixels
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Map pixels (B, height, width, channels), uint8 or float in [0, 1], to features (B, F)."""
+        """Map pixels (B, height, width, channels), uint8 or float in [0, 1], to the last layer's maps, flattened."""
         scaled = pixels.float().mul_(1 / 255) if pixels.dtype == torch.uint8 else pixels
-        features = super().forward(scaled.permute(0, 3, 1, 2))  # (B, channels, height, width)
+        features = super().forward(scaled.permute(0, 3, 1, 2))  # (B, 64, smaller height, smaller width)
         return features.permute(0, 2, 3, 1).flatten(1)  # a view, since they are stored channels last
 
 
@@ -1165,18 +1162,18 @@ class Agent(nn.Module):
 def make_optimizers(agent: Agent, args: Args) -> list[torch.optim.Optimizer]:
     """Return AdamW, and with --optimizer muon also Muon (Jordan et al., 2024) for the matrices between hidden layers.
 
-    Its steps are orthogonal: all directions of a matrix change alike. Outer layers, whose other side is an observation
-    or an output, are AdamW's, as is all that is no matrix of one `nn.Linear`: recurrent layers stack those of gates.
+    Its steps are orthogonal: all directions of a matrix change equally. Outer layers, whose other side is an
+    observation or an output, are AdamW's, as is all that is no weight of an `nn.Linear`, such as recurrent layers.
     """
+    if args.optimizer == "adamw":
+        return [torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)]
     outer = ("encoder.mlp.", "heads.policy.2.", "heads.value.2.", "decoder.", "estimator.")
     linear = {layer.weight for layer in agent.modules() if isinstance(layer, nn.Linear)}
-    named = agent.named_parameters() if args.optimizer == "muon" else []
-    hidden = {weight: name for name, weight in named if weight in linear and not name.startswith(outer)}
+    named = agent.named_parameters()
+    hidden = dict.fromkeys(weight for name, weight in named if weight in linear and not name.startswith(outer))
     others = [weight for weight in agent.parameters() if weight not in hidden]
-    optimizers = [torch.optim.AdamW(others, lr=args.init_lr, fused=True)]
-    if hidden:
-        optimizers.append(torch.optim.Muon([*hidden], weight_decay=0.01, adjust_lr_fn="match_rms_adamw"))
-    return optimizers
+    muon = torch.optim.Muon([*hidden], weight_decay=0.01, adjust_lr_fn="match_rms_adamw")
+    return [torch.optim.AdamW(others, lr=args.init_lr, fused=True), muon]
 
 
 def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:

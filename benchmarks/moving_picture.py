@@ -1,6 +1,6 @@
 """Draw an agent at work: what it would see beside the debug view, a frame for each step of a level's episode.
 
-python benchmarks/moving_picture.py agents/mortar-mayhem-grid-trxl.pt docs/agent.gif
+    python benchmarks/moving_picture.py agents/mortar-mayhem-grid-trxl.pt docs/agent.gif
 
 The level is one of the test levels, with the agent's own environment and options.
 """
@@ -43,14 +43,14 @@ def main(path: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path], leve
     options = json.loads(player.args.env_options)
     (observation, _), _ = (env.reset(seed=level, options=options) for env in envs)
     names = joined([np.asarray(text(name, SIDE)) for name in ("agent's view", "debug view")], axis=1)
-    frames, done, info = [], False, {}
+    frames, done, info, reward = [], False, {}, 0.0
     while True:
         views = [Image.fromarray(env.render()).resize((SIDE, SIDE), Image.Resampling.NEAREST) for env in envs]
         frames.append(Image.fromarray(np.concatenate([names, joined([np.asarray(view) for view in views], axis=1)])))
         if done:
             break
-        action = player.act(observation)
-        (observation, _, terminated, truncated, info), _ = (env.step(action) for env in envs)
+        action = player.act(observation, reward)
+        (observation, reward, terminated, truncated, info), _ = (env.step(action) for env in envs)
         done = terminated or truncated
     durations = [MILLISECONDS] * (len(frames) - 1) + [LAST * MILLISECONDS]
     frames[0].save(out, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)

@@ -65,7 +65,7 @@ def training_envs(args: Any, checkpoint: dict[str, Any] | None) -> VectorEnv:
     rank, processes = rank_and_size()
     share = args.num_envs // processes
     # Environments that cannot be restored must not repeat the episodes that the run began with.
-    seed = args.seed if checkpoint is None or checkpoint["step"] == 0 else [args.seed, checkpoint["step"]]
+    seed = args.seed if checkpoint is None else [args.seed, checkpoint["step"]]
     mode = "debug_rgb_array" if args.capture_video else None
     return envs_for(args, share, seed=seed, first_lane=rank * share, render_mode=mode)
 
@@ -190,7 +190,7 @@ def wrap_envs(
 def save_state(envs: VectorEnv) -> dict[str, Any] | None:
     """Return the whole state of environments from `make_envs`, or None if there are parts of other packages in them.
 
-    They may be in a `LaneVideo`, whose state is the numbers of the episode and the step.
+    They may be in a `LaneVideo`, whose state is the number of the episode.
     Saved are: every array of the environment, with the levels that are being played; each lane's generator and its
     seed, and the one that chooses levels; the present options, which automatic resets keep; frame stacks, step numbers
     and last actions; the lights of the perturbation and their generators; returns and lengths of the episodes so far,

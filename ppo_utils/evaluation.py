@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ppo_utils.environments import as_tensors, final_numbers
 
 REPEATS = 3  # times that each level is played
-MEMORY_STEPS = 64  # that a memory has room for, before it begins anew with what it carries on
+MEMORY_STEPS = 64  # that a memory has room for, until `begin_rollout` makes room again
 
 
 def first_unseen(args: Any) -> int:

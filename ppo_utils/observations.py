@@ -15,12 +15,13 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
 from memory_gym_envs.base import lane_seeds
 from memory_gym_envs.options import brief
+from ppo_utils.lanes import OWN
 from ppo_utils.processes import RunError
 from ppo_utils.wrappers import OBSERVATION, one_hot
 
 SMALLEST_PICTURE = 36  # pixels along a side; what is smaller becomes a vector
 WRITABLE = ("C_CONTIGUOUS", "WRITEABLE")  # wrappers overwrite observations in place
-INFOS = ("own", "ground_truth", "_ground_truth", "final_obs", "_final_obs", "final_info", "_final_info")
+INFOS = (OWN, "ground_truth", "_ground_truth", "final_obs", "_final_obs", "final_info", "_final_info")
 
 
 class ObservationParts(VectorWrapper):

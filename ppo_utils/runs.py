@@ -82,8 +82,7 @@ class Run:
     lengths: deque = field(default_factory=lambda: deque(maxlen=100))
     received_signal: int = 0  # number of the signal (SIGINT or SIGTERM) that this process got, or 0
     stop: bool = False  # a process got one: this iteration is the last
-    episodes: dict[str, list[float]] = field(default_factory=dict)  # metrics of those that ended in the last iteration
-    scores: dict[str, torch.Tensor] = field(default_factory=dict)  # of its evaluation, see `level_scores`
+    scores: dict[str, torch.Tensor] = field(default_factory=dict)  # of the last evaluation, see `level_scores`
 
 
 # ---- setting up ----
@@ -185,7 +184,7 @@ def open_folder(args: Any, run: Run) -> None:
 
     Raises OSError if it cannot be written or is in use, or as `start_tracking` does.
     """
-    run.folder = make_folder(args, run.script) if args.resume is None else Path(args.resume)
+    run.folder = make_folder(args) if args.resume is None else Path(args.resume)
     if not os.access(run.folder, os.W_OK):
         raise OSError(f"--resume {run.folder}: this folder cannot be written")
     run.lock = (run.folder / ".lock").open("w")
@@ -211,7 +210,7 @@ def open_folder(args: Any, run: Run) -> None:
         run.envs = LaneVideo(run.envs, str(run.folder / (f"videos-{run.step}" if run.step else "videos")))
 
 
-def make_folder(args: Any, script: str) -> Path:
+def make_folder(args: Any) -> Path:
     """Make a run folder; runs of the same name that begin in the same second get a number. Raises OSError."""
     env_id = args.env_id.replace("/", "-").replace(":", "-")
     first = Path("runs") / f"{env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
@@ -295,23 +294,22 @@ def level_scores(args: Any, run: Run) -> dict[str, torch.Tensor]:
         torch.manual_seed(args.seed)
         levels = evaluation_levels(args, args.eval_levels)
         metrics = evaluate(run.agent, run.eval_envs, levels, args.eval_max_steps, amp=args.amp)
-    missing = {name: int(np.isnan(values).sum()) for name, values in metrics.items()}
-    for name in filter(missing.get, metrics):
-        tell_left_out(name, missing[name], len(levels))
-    complete = {name: torch.from_numpy(values) for name, values in metrics.items() if not missing[name]}
+    incomplete = [name for name, values in metrics.items() if np.isnan(values).any()]
+    for name in incomplete:
+        tell_incomplete(name)
+    complete = {name: torch.from_numpy(values) for name, values in metrics.items() if name not in incomplete}
     return {name: values.unflatten(0, (-1, REPEATS)) for name, values in complete.items()}
 
 
 @functools.cache
-def tell_left_out(name: str, missing: int, episodes: int) -> None:
+def tell_incomplete(name: str) -> None:
     """Say, once, that evaluations leave a metric out."""
-    print(f"\nevaluations leave out {name}: {missing} of {episodes} episodes do not report it", file=sys.stderr)
+    print(f"\nevaluations leave out {name}: not all of their episodes report it", file=sys.stderr)
 
 
 def write_logs(args: Any, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
     """Write an iteration's numbers to TensorBoard and the progress bar; the first process does."""
     run.seconds += logs["charts/seconds_iteration"]
-    run.episodes = episodes
     run.returns.extend(episodes.get("charts/episodic_return", []))
     run.lengths.extend(episodes.get("charts/episodic_length", []))
     if run.writer is None:

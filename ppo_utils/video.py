@@ -48,7 +48,8 @@ class LaneVideo(Saved, VectorWrapper):
         if terminated[0] or truncated[0]:
             self._end()
             self.episode, self.frames = self.episode + 1, 0
-            self.recording = self.episode % 1000 == 0 or round(self.episode ** (1 / 3)) ** 3 == self.episode
+            is_cube = round(self.episode ** (1 / 3)) ** 3 == self.episode
+            self.recording = is_cube if self.episode < 1000 else self.episode % 1000 == 0
         return result
 
     def close(self, **kwargs: Any) -> None:

@@ -334,6 +334,13 @@ def test_other_environments_have_no_events(saved):
     assert played().events == {}
 
 
+def test_an_agent_trained_in_processes_plays_in_this_one(saved):
+    saved(env_id="CartPole-v1", async_envs=True)
+    _, envs, _ = enjoy.load("model.pt")
+    assert not isinstance(envs.unwrapped, gym.vector.AsyncVectorEnv)
+    envs.close()
+
+
 # ---- several episodes ----
 def test_agents_and_levels(saved):
     saved(num_levels=5)

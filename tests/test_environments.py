@@ -573,6 +573,16 @@ def test_an_endless_episode_has_a_video_too(tmp_path, monkeypatch):
         assert frames_of(tmp_path / str(steps)) == {"episode-0.mp4": expected}
 
 
+def test_which_episodes_have_a_video(tmp_path, monkeypatch):
+    monkeypatch.setattr(LaneVideo, "_film", lambda self: None)
+    envs = filmed("MysteryPath-Grid-v0", 1, tmp_path, {"max_steps": 1})
+    recorded = []
+    for _ in range(3001):  # episodes of a step
+        recorded += [envs.episode] * envs.recording
+        envs.step(np.zeros((1, 1), int))
+    assert recorded == [0, 1, 8, 27, 64, 125, 216, 343, 512, 729, 1000, 2000, 3000]
+
+
 @pytest.mark.parametrize("env_id", ["FrozenLake-v1", "minigrid:MiniGrid-MemoryS7-v0"])
 def test_videos_of_other_packages(env_id, tmp_path):
     envs = filmed(needs(env_id), 2, tmp_path)
