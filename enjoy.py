@@ -413,8 +413,10 @@ def memory_of(args: Any) -> str:
         parts = [{"gru": "GRU", "lstm": "LSTM", "none": "no memory"}[args.memory]]
         parts += [f"{args.num_layers} x {args.hidden_size} units"] * (args.memory != "none")
     elif hasattr(args, "trxl_gate"):
-        parts = ["GTrXL" if args.trxl_gate == "gru" else "TrXL", f"{args.trxl_num_layers} blocks"]
-        parts += [f"{args.trxl_num_heads} heads", f"width {args.trxl_dim}", f"window {args.trxl_memory_length}"]
+        parts = ["GTrXL" if args.trxl_gate == "gru" else "TrXL"]
+        counts = {"block": args.trxl_num_layers, "head": args.trxl_num_heads}
+        parts += [f"{count} {name}{'s' * (count > 1)}" for name, count in counts.items()]
+        parts += [f"width {args.trxl_dim}", f"window {args.trxl_memory_length}"]
         encoding = args.trxl_positional_encoding.replace("none", "no")
         parts += [f"{encoding} positional encoding", f"{args.trxl_layer_norm}-norm"]
     else:

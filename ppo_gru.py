@@ -204,8 +204,8 @@ LAPTOP = {
     "exploration_bonus": "log-barrier",
     "init_ent_coef": 2e-3,
     "final_ent_coef": 2e-4,
-    "anneal_steps": 4_000_000,
-    "total_timesteps": 4_000_000,
+    "anneal_steps": 6_000_000,
+    "total_timesteps": 6_000_000,
 }
 QUICKSTART = {
     **LAPTOP,

@@ -210,7 +210,7 @@ class Args:
 LAPTOP = {
     "preset": "laptop",
     "obs_type": "vector",
-    "trxl_num_layers": 2,
+    "trxl_num_layers": 1,
     "trxl_dim": 96,
     "trxl_query_position": True,
     "trxl_memory_gradient": True,
@@ -230,8 +230,8 @@ LAPTOP = {
     "exploration_bonus": "log-barrier",
     "init_ent_coef": 2e-3,
     "final_ent_coef": 2e-4,
-    "anneal_steps": 4_000_000,
-    "total_timesteps": 4_000_000,
+    "anneal_steps": 6_000_000,
+    "total_timesteps": 6_000_000,
 }
 QUICKSTART = {
     **LAPTOP,

@@ -9,7 +9,8 @@ import evaluate
 # What --preset laptop was until Muon: the agents of the suites small and full have these settings.
 ADAMW = "--optimizer adamw --no-norm-reward --num-envs 32 --update-epochs 4 --num-minibatches 8"
 ADAMW += " --init-lr 1e-3 --final-lr 1e-4 --init-ent-coef 5e-4 --final-ent-coef 5e-5"
-GRU, ADAMW_TRXL = f"ppo_gru.py {ADAMW}", f"ppo_trxl.py {ADAMW} --trxl-dim 64 --trxl-memory-length 128"
+GRU = f"ppo_gru.py {ADAMW}"
+ADAMW_TRXL = f"ppo_trxl.py {ADAMW} --trxl-num-layers 2 --trxl-dim 64 --trxl-memory-length 128"
 TRXL = f"{ADAMW_TRXL} --no-trxl-query-position --no-trxl-memory-gradient"  # the thesis', where the preset differs
 MEMORIES = {
     "GRU": f"{GRU} --memory gru",
@@ -138,7 +139,7 @@ FULL = {  # trained for what two cores can do in a day, all agents and seeds tog
 LAPTOP = {
     env_id: replace(FULL[env_id], total_timesteps=int(1_000_000 * millions))
     for env_id, millions in {
-        "MortarMayhem-Grid-v0": 4.8,
+        "MortarMayhem-Grid-v0": 6,
         "Endless-MortarMayhem-v0": 3,
         "Endless-MysteryPath-v0": 3,
         "SearingSpotlights-v0": 3,

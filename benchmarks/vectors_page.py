@@ -16,9 +16,9 @@ from memory_gym_envs.variant import Variant
 
 HEAD = """# Vector observations
 
-`gym.make(id, obs_type="vector")`, and `gym.make_vec` likewise, return a flat float32 vector in place of the frame, and
-draw none. It holds what the frame shows and nothing that it hides: under the same options, two states with the same
-frame have the same vector. What is not in sight is 0.
+`gym.make(id, obs_type="vector")`, and `gym.make_vec` likewise, return a flat float32 vector in place of the image, and
+draw none. It holds what the image shows and nothing that it hides: under the same options, two states with the same
+image have the same vector. What is not in sight is 0.
 
 A column with ids says where the entries are in their vector, counted from 0; its length is in brackets. Entries are
 from 0 to 1, unless a range stands beside them. Pixels count from the left and from the top of the 84 x 84 screen, x

@@ -31,7 +31,5 @@ def test_an_agent_plays_as_well_as_published(name, metric, score, flags):
     # Within four standard errors of fewer levels and, with other roundings, other actions.
     assert scores.mean() == pytest.approx(float(score), abs=0.005 + 4 * scores.std() / scores.size**0.5)
 
-    config = tyro.cli(learning.Config, args=shlex.split(flags))
-    (task,), (agent,), (seed,) = config.tasks, config.agents, config.seeds
-    planned = learning.plan(config, learning.TASKS[task], agent, seed)
+    (planned,) = learning.plans_of(tyro.cli(learning.Config, args=shlex.split(flags))).values()
     assert asdict(planned.args) == asdict(checkpoint.args)

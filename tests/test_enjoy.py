@@ -296,6 +296,7 @@ def test_what_sets_agents_apart(tiny):
     assert names[2].endswith("absolute positional encoding, pre-norm, query output")
     assert names[6].endswith("pre-norm, frame stack 4")
     assert len({*names}) == len(names)
+    assert enjoy.memory_of(tiny(ppo_trxl, trxl_num_layers=1)).startswith("TrXL, 1 block, ")
 
 
 # ---- events ----
