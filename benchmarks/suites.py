@@ -143,6 +143,7 @@ LAPTOP = {
         "Endless-MortarMayhem-v0": 3,
         "Endless-MysteryPath-v0": 3,
         "SearingSpotlights-v0": 3,
+        "Endless-SearingSpotlights-v0": 3,
     }.items()
 }
 # In the full tasks, transformers have about as many parameters as the GRU.

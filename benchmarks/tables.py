@@ -254,7 +254,7 @@ def draw(tasks: dict[str, evaluate.Runs], out: Path) -> None:
 
     An axis goes from 0 to the best possible score, or where there is no bound to a bit above the highest curve.
     """
-    down = math.ceil(len(tasks) / 5)
+    down = 1 if len(tasks) <= 3 else 2
     across = math.ceil(len(tasks) / down)
     figure = Figure(figsize=(4 * across, 3.2 * down), layout="constrained")
     grid = figure.subplots(down, across, squeeze=False).ravel()
