@@ -198,11 +198,15 @@ def result_of(config: Training, plan: Plan) -> evaluate.RunLog | None:
     return run
 
 
-def is_complete(run: evaluate.RunLog) -> bool:
-    """Return whether a run has trained for all its steps and written its final weights."""
+def has_all_steps(run: evaluate.RunLog) -> bool:
+    """Return whether a run has trained for all its steps."""
     total, *batch = (int(run.args[name]) for name in ("total_timesteps", "num_envs", "num_steps"))
-    is_trained = run.has_seconds() and run.last_step + math.prod(batch) > total
-    return is_trained and (Path(run.path) / "model.pt").is_file()
+    return run.has_seconds() and run.last_step + math.prod(batch) > total
+
+
+def is_complete(run: evaluate.RunLog) -> bool:
+    """Return whether the run of a folder has all its steps, and its final weights are written."""
+    return has_all_steps(run) and (Path(run.path) / "model.pt").is_file()
 
 
 def expected_hours(config: Training, missing: list[Plan]) -> str:
