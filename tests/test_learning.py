@@ -245,19 +245,22 @@ def test_weights_of_an_earlier_step_are_not_scored(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("last", "tested"), [(None, True), (64, True), ("end", False)])
 def test_a_run_without_a_score_at_its_end_is_no_result(last, tested, tmp_path, monkeypatch):
     """It has none, or only one of an earlier evaluation, or none on the test levels."""
-    config = learning.Config(folder=tmp_path, results=tmp_path)
+    config = learning.Config(folder=tmp_path, results=tmp_path / "results")
     plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", 1)
     end = plan.args.total_timesteps // 4096 * 4096
     curves = {name: (np.array([end]), np.ones((1, 1, 1))) for name in evaluate.SECONDS.values()}
     if last is not None:
         curves["eval/commands_completed"] = np.array([end if last == "end" else last]), np.ones((1, 1, 1))
-    run = evaluate.RunLog("run", plan.logged_args(), curves)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "model.pt").touch()
+    run = evaluate.RunLog(str(folder), plan.logged_args(), curves)
     monkeypatch.setattr(learning, "runs_in", lambda place, plan: [run])
     test = {"test/commands_completed": ([end], np.ones((1, 5, 1)))} if tested else {}
     monkeypatch.setattr(learning, "test_scores", lambda *_: test)
     with pytest.raises(SystemExit, match=r"GRU on .*, has no commands_completed at its end: an evaluation was cut"):
         learning.write_result(config, plan)
-    assert not list(tmp_path.iterdir())
+    assert not (tmp_path / "results").exists()
 
 
 def test_runs_share_the_cores_unless_told_how_many_threads_to_have(tmp_path, monkeypatch):
