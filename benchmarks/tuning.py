@@ -49,20 +49,19 @@ def plans_of(task: str, suite: str, agent: str) -> dict[tuple[str, str, int], le
 
 def measure_speeds() -> None:
     """Train for a few iterations with each script and preset in turn, on one core, and write their steps per second."""
-    with SPEEDS.open("w", newline="") as file, tempfile.TemporaryDirectory() as folder:
-        writer = csv.writer(file)
-        writer.writerow(("task", "script", "preset", "steps_per_second"))
-        for task in LAPTOP:
-            for (script, preset), (suite, agent) in AGENTS.items():
-                plan = next(iter(plans_of(task, suite, agent).values()))
-                flags = ["--no-save-model", "--eval-interval", "0", "--total-timesteps", str(STEPS)]
+    rows = [("task", "script", "preset", "steps_per_second")]
+    flags = ["--no-save-model", "--eval-interval", "0", "--total-timesteps", str(STEPS)]
+    for task in LAPTOP:
+        for (script, preset), (suite, agent) in AGENTS.items():
+            plan = next(iter(plans_of(task, suite, agent).values()))
+            with tempfile.TemporaryDirectory() as folder:
                 env = {**os.environ, "OMP_NUM_THREADS": "1"}
-                subprocess.run([*plan.command, *flags], check=True, cwd=folder, env=env, capture_output=True)
+                subprocess.run([*plan.command, *flags], check=True, cwd=folder, env=env)
                 (run,) = (Path(folder) / "runs").iterdir()
                 speed = evaluate.read_run(str(run)).curves["charts/SPS"][1][-1].item()
-                run.rename(Path(folder) / f"{task}-{script}-{preset}")
-                writer.writerow((task, script, preset, round(speed)))
-                file.flush()
+            rows.append((task, script, preset, round(speed)))
+    with SPEEDS.open("w", newline="") as file:  # at the end: a failed training loses nothing
+        csv.writer(file).writerows(rows)
 
 
 def table(speeds: dict[tuple[str, str, str], float]) -> str:
