@@ -4,6 +4,8 @@
 
 Scores are those of benchmarks/results on development levels. Speeds are those of benchmarks/steps_per_second.csv, which
 --measure writes: short trainings in turn, for which the machine has to have nothing else to do.
+
+    python benchmarks/tuning.py --measure MortarMayhem-Grid-v0 SearingSpotlights-v0
 """
 
 import csv
@@ -38,8 +40,8 @@ STEPS = 81_920  # of a training that is measured
 class Config:
     """What to do before the table is printed."""
 
-    measure: bool = False
-    """measure the steps per second of this machine, which takes some minutes"""
+    measure: tuple[str, ...] = ()
+    """the tasks whose steps per second are measured again on this machine, within two minutes a task"""
 
 
 def plans_of(task: str, suite: str, agent: str) -> dict[tuple[str, str, int], learning.Plan]:
@@ -47,21 +49,33 @@ def plans_of(task: str, suite: str, agent: str) -> dict[tuple[str, str, int], le
     return learning.plans_of(learning.Config(suite=suite, tasks=(task,), agents=(agent,), results=RESULTS))
 
 
-def measure_speeds() -> None:
-    """Train for a few iterations with each script and preset in turn, on one core, and write their steps per second."""
-    rows = [("task", "script", "preset", "steps_per_second")]
+def read_speeds() -> dict[tuple[str, str, str], float]:
+    """Return the steps per second that were measured, by task, script and preset."""
+    with SPEEDS.open(newline="") as file:
+        return {tuple(key): float(speed) for *key, speed in [*csv.reader(file)][1:]}
+
+
+def measure_speeds(tasks: tuple[str, ...]) -> None:
+    """Train for a few iterations with each script and preset in turn, on one core, and write their steps per second.
+
+    Raises SystemExit for tasks that today's preset was not trained on.
+    """
+    if unknown := {*tasks} - {*LAPTOP}:
+        raise SystemExit(f"there is no {min(unknown)!r}; there are {'; '.join(LAPTOP)}")
+    speeds = read_speeds()
     flags = ["--no-save-model", "--eval-interval", "0", "--total-timesteps", str(STEPS)]
-    for task in LAPTOP:
+    for task in tasks:
         for (script, preset), (suite, agent) in AGENTS.items():
             plan = next(iter(plans_of(task, suite, agent).values()))
             with tempfile.TemporaryDirectory() as folder:
                 env = {**os.environ, "OMP_NUM_THREADS": "1"}
                 subprocess.run([*plan.command, *flags], check=True, cwd=folder, env=env)
                 (run,) = (Path(folder) / "runs").iterdir()
-                speed = evaluate.read_run(str(run)).curves["charts/SPS"][1][-1].item()
-            rows.append((task, script, preset, round(speed)))
+                speeds[task, script, preset] = evaluate.read_run(str(run)).curves["charts/SPS"][1][-1].item()
     with SPEEDS.open("w", newline="") as file:  # at the end: a failed training loses nothing
-        csv.writer(file).writerows(rows)
+        in_order = sorted(speeds.items(), key=lambda each: [*LAPTOP].index(each[0][0]))
+        rows = [(*key, round(speed)) for key, speed in in_order]
+        csv.writer(file).writerows([("task", "script", "preset", "steps_per_second"), *rows])
 
 
 def table(speeds: dict[tuple[str, str, str], float]) -> str:
@@ -96,10 +110,8 @@ def table(speeds: dict[tuple[str, str, str], float]) -> str:
 def main(config: Config) -> None:
     """Print the table."""
     if config.measure:
-        measure_speeds()
-    with SPEEDS.open(newline="") as file:
-        rows = [*csv.DictReader(file)]
-    print(table({(row["task"], row["script"], row["preset"]): float(row["steps_per_second"]) for row in rows}))
+        measure_speeds(config.measure)
+    print(table(read_speeds()))
 
 
 if __name__ == "__main__":

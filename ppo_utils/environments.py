@@ -376,7 +376,7 @@ def ground_truth_of(infos: dict[str, Any], args: Any, before: np.ndarray | None 
     if not args.ground_truth_coef:
         return None
     if OWN in infos:
-        truths = [info.get("ground_truth") for (info,) in infos[OWN]]
+        truths = [info.get("ground_truth") for info, _ in infos[OWN]]
         reported = [truth is not None for truth in truths]
     else:
         truths = infos.get("ground_truth")

@@ -11,7 +11,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -22,7 +22,7 @@ from gymnasium.vector.async_vector_env import AsyncState
 from memory_gym_envs.options import brief
 from ppo_utils.processes import RunError
 
-OWN = "own"  # where an info has what a lane's own info was
+OWN = "own"  # where an info has a lane's own info, and its `Place`
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,33 @@ class Levels:
     count: int = 0
 
 
-class Lane(gym.Wrapper):
-    """One environment of several. What its step or reset raises says which one it was and how to get there again.
+class Place(NamedTuple):
+    """Where an environment was, for messages: its number, its last seed, and how many steps it has taken since."""
 
-    Errors become the cause of a RuntimeError, whose message has the number of the lane, the seed that the environment
-    was last reset with, and the number of the step since then.
+    number: int
+    seed: int | None
+    steps: int
+
+    @property
+    def step(self) -> str:
+        """Name the step, counted from the last reset with a seed."""
+        began = "it was made" if self.seed is None else f"its reset with seed {self.seed}"
+        return f"step {self.steps} since {began}"
+
+    def __str__(self) -> str:
+        return f"environment {self.number}, {self.step}"
+
+
+class UnfitError(ValueError):
+    """An observation or a reward is not what it should be."""
+
+
+class Lane(gym.Wrapper):
+    """One environment of several. Its errors say which one it was and how to get there again.
+
+    What it raises becomes the cause of a RuntimeError. An observation that does not fit its space (see `check_fits`),
+    or a reward that is not one number, is a RunError. Both have the number of the lane, the seed that the environment
+    was last reset with, and the number of the step since then, which infos have too, for what is found later.
 
     A reset without a seed takes one of the levels, if there are any; which ones depends on the last seed that was
     given. The last observation and info of an episode are copies, since some environments return the same arrays at
@@ -51,35 +73,30 @@ class Lane(gym.Wrapper):
         self._seed, self._steps, self._rng = None, 0, np.random.default_rng()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment. Raises RuntimeError for what it raises."""
+        """Reset the environment. Raises RuntimeError for what it raises, RunError for what it should not return."""
         if seed is not None:
             self._rng = np.random.default_rng(seed)
         elif self._levels.count:
             seed = self._levels.first + int(self._rng.integers(self._levels.count))
         if seed is not None:
             self._seed, self._steps = seed, 0
-        try:
+        with self._located("the reset after "):
             observation, info = self.env.reset(seed=seed, options=options)
             check_fits(self.observation_space, observation)
-        except Exception as error:
-            raise self._located(error, "the reset after step") from error
-        return observation, {OWN: (dict(info),)}
+            return observation, {OWN: (dict(info), self._place)}
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment. Raises RuntimeError for what it raises."""
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Step the environment. Raises RuntimeError for what it raises, RunError for what it should not return."""
         self._steps += 1
-        try:
+        with self._located(""):
             observation, reward, terminated, truncated, info = self.env.step(action)
             check_fits(self.observation_space, observation)
-            if np.size(reward) != 1 or reward is None:
-                raise ValueError(f"the reward is {brief(reward)}, not a number")
-        except Exception as error:
-            raise self._located(error, "step") from error
+            reward, info = one_number(reward), dict(info)
         if terminated or truncated:
             observation = copy.deepcopy(observation)
             with contextlib.suppress(Exception):  # something in it cannot be copied
                 info = copy.deepcopy(info)
-        return observation, np.asarray(reward).item(), terminated, truncated, {OWN: (dict(info),)}
+        return observation, reward, terminated, truncated, {OWN: (info, self._place)}
 
     def close(self) -> None:
         """Close the environment; what it raises is a line on stderr, since nothing that follows needs it."""
@@ -88,10 +105,20 @@ class Lane(gym.Wrapper):
         except Exception as error:
             print(f"environment {self._number} raised {error!r} when it was closed", file=sys.stderr)
 
-    def _located(self, error: Exception, where: str) -> RuntimeError:
-        began = "it was made, never reset with a seed" if self._seed is None else f"its reset with seed {self._seed}"
-        what = f"{type(error).__name__} in {where} {self._steps} since {began}"
-        return RuntimeError(": ".join(filter(None, [f"environment {self._number} raised {what}", one_line(error)])))
+    @property
+    def _place(self) -> "Place":
+        return Place(self._number, self._seed, self._steps)
+
+    @contextlib.contextmanager
+    def _located(self, where: str) -> Iterator[None]:
+        """Say of errors in which environment and step they were."""
+        try:
+            yield
+        except UnfitError as error:
+            raise RunError(f"{self.spec.id}: {error} ({self._place})") from None
+        except Exception as error:
+            what = f"environment {self._number} raised {type(error).__name__} in {where}{self._place.step}"
+            raise RuntimeError(": ".join(filter(None, [what, one_line(error)]))) from error
 
 
 class AsyncLanes(AsyncVectorEnv):
@@ -165,21 +192,34 @@ def make_lane(spec: EnvSpec, kwargs: dict[str, Any], levels: Levels, asynchronou
 
 
 def check_fits(space: gym.Space, observation: Any, name: str = "observation") -> None:
-    """Raise ValueError if an observation has not the keys, shapes or kinds of numbers of its space."""
+    """Raise UnfitError if an observation has not the keys, shapes or kinds of numbers of its space."""
     if isinstance(space, (gym.spaces.Dict, gym.spaces.Tuple)):
         parts = space.spaces if isinstance(space, gym.spaces.Dict) else dict(enumerate(space.spaces))
         for key, part in parts.items():
             try:
                 inside = observation[key]
             except (KeyError, IndexError, TypeError):
-                raise ValueError(f"{name} has no {key!r}: {brief(observation)}") from None
+                raise UnfitError(f"{name} has no {key!r}: {brief(observation)}") from None
             check_fits(part, inside, f"{name}.{key}")
     elif isinstance(space, (gym.spaces.Box, gym.spaces.Discrete, gym.spaces.MultiDiscrete, gym.spaces.MultiBinary)):
         array = np.asarray(observation)
         if array.shape != space.shape or not np.can_cast(array.dtype, space.dtype, "same_kind"):
-            raise ValueError(
+            raise UnfitError(
                 f"{name} is of {array.dtype}, shape {array.shape}, and its space {space.dtype}, {space.shape}"
             )
+        if space.dtype.kind in "iu" and not np.can_cast(array.dtype, space.dtype):  # too large numbers would wrap around
+            least, most = np.iinfo(space.dtype).min, np.iinfo(space.dtype).max
+            wrong = array[(array < least) | (array > most)]
+            if wrong.size:
+                raise UnfitError(f"{name} has an entry {wrong[0]}, outside of {least} to {most}")
+
+
+def one_number(reward: Any) -> float:
+    """Return a reward, which may be an array of one number. Raises UnfitError for anything else."""
+    try:
+        return float(np.asarray(reward).item())
+    except (TypeError, ValueError):
+        raise UnfitError(f"the reward is {brief(reward)}, not a number") from None
 
 
 def check_kwargs(env_id: str, create: Callable, kwargs: dict[str, Any]) -> None:
@@ -209,10 +249,12 @@ def resets_in_same_step(envs: Any) -> bool:
 def one_line_errors(what: str) -> Iterator[None]:
     """Turn what an environment raises into a ValueError of one line that begins with what failed.
 
-    Errors whose cause is the machine or the installation stay as they are.
+    Errors whose cause is the machine or the installation stay as they are, and a RunError, which is one line.
     """
     try:
         yield
+    except RunError:
+        raise
     except Exception as error:
         first = error.__cause__ if isinstance(error, RuntimeError) and error.__cause__ else error  # see Lane
         if isinstance(first, (gym.error.Error, ImportError, OSError, MemoryError)):

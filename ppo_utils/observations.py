@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
 from memory_gym_envs.base import lane_seeds
 from memory_gym_envs.options import brief
-from ppo_utils.lanes import OWN
+from ppo_utils.lanes import OWN, Place
 from ppo_utils.processes import RunError
 from ppo_utils.wrappers import OBSERVATION, one_hot
 
@@ -34,8 +34,8 @@ class ObservationParts(VectorWrapper):
 
     Raises ValueError for spaces that are not supported (see `Part.of`), and if nothing is left to observe. Where an
     environment observes NaN, infinity or what its space does not hold, or earns such a reward, step and reset raise
-    RunError with one line that says which environment, part and step it was. Of infos, only what a training reads is
-    kept.
+    RunError with one line that says which environment, part and step it was; the bounds of vectors are not checked. Of
+    infos, only what a training reads is kept.
     """
 
     def __init__(self, env: VectorEnv, first_lane: int = 0):
@@ -60,34 +60,35 @@ class ObservationParts(VectorWrapper):
         if seed is not None:
             self._seeds, self._steps = lane_seeds(seed, self.num_envs), 0
         observations, infos = self.env.reset(seed=seed, options=options)
-        return self._convert(observations), {name: infos[name] for name in INFOS if name in infos}
+        return self._convert(observations, infos), {name: infos[name] for name in INFOS if name in infos}
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], Any, Any, Any, dict[str, Any]]:
         """Step every lane, its observations in parts, those in `final_obs` too."""
         self._steps += 1
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        done = terminated | truncated
         if not np.isfinite(rewards).all():
             lane = int(np.flatnonzero(~np.isfinite(rewards))[0])
-            raise self._error(lane, f"the reward is {rewards[lane]}")
+            raise self._error(lane, f"the reward is {rewards[lane]}", infos.get("final_info") if done[lane] else infos)
         infos = {name: infos[name] for name in INFOS if name in infos}
-        ended = np.flatnonzero(terminated | truncated)
+        ended = np.flatnonzero(done)
         if ended.size:
-            last = self._convert(self._final(infos, ended), ended)
-            infos["final_obs"], infos["_final_obs"] = np.full(self.num_envs, None), terminated | truncated
+            last = self._convert(self._final(infos, ended), infos.get("final_info"), ended)
+            infos["final_obs"], infos["_final_obs"] = np.full(self.num_envs, None), done
             for row, lane in enumerate(ended.tolist()):
                 infos["final_obs"][lane] = {name: part[row] for name, part in last.items()}
-        return self._convert(observations), rewards, terminated, truncated, infos
+        return self._convert(observations, infos), rewards, terminated, truncated, infos
 
     def _final(self, infos: dict[str, Any], ended: np.ndarray) -> Any:
         """Return the last observations of ended episodes, (n,) lanes, as one batch."""
         space, final = self.env.single_observation_space, infos.get("final_obs")
         if final is None:
-            raise self._error(int(ended[0]), "an episode ended, and infos have no final_obs")
+            raise self._error(int(ended[0]), "an episode ended, and infos have no final_obs", infos)
         if isinstance(final, np.ndarray) and final.dtype == object:  # as Gymnasium has it: an observation for each lane
             return concatenate(space, final[ended], create_empty_array(space, len(ended)))
         return rows_of(final, ended)  # one batch for all lanes
 
-    def _convert(self, observations: Any, lanes: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    def _convert(self, observations: Any, infos: Any, lanes: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Return the parts of observations, each (N, ...); no copies of what is right already."""
         parts = {}
         for name, part in self._parts.items():
@@ -95,14 +96,14 @@ class ObservationParts(VectorWrapper):
                 parts[name] = part.convert(observations)
             except WrongValue as error:
                 row, what = error.args
-                raise self._error(row if lanes is None else int(lanes[row]), f"{name} {what}") from None
+                raise self._error(row if lanes is None else int(lanes[row]), f"{name} {what}", infos) from None
         return parts
 
-    def _error(self, lane: int, what: str) -> RunError:
-        seed = self._seeds[lane]
-        began = "it was made" if seed is None else f"its reset with seed {seed}"
-        where = f"environment {self._first_lane + lane}, step {self._steps} since {began}"
-        return RunError(f"{self.env.spec.id}: {what} ({where})")
+    def _error(self, lane: int, what: str, infos: Any) -> RunError:
+        place = Place(self._first_lane + lane, self._seeds[lane], self._steps)
+        if isinstance(infos, dict) and OWN in infos:  # a Lane, which may have been reset with seeds of its own
+            _, place = infos[OWN][lane]
+        return RunError(f"{self.env.spec.id}: {what} ({place})")
 
 
 class WrongValue(Exception):
@@ -160,7 +161,8 @@ class Part:
     def convert(self, observations: Any) -> np.ndarray:
         """Take this part out of a batch of observations: (n, H, W, C) uint8 or float32, or (n, V) float32.
 
-        Raises WrongValue for NaN, infinity, and numbers that a Discrete or MultiDiscrete space does not have.
+        Raises WrongValue for NaN, infinity, and numbers that are outside of an image's bounds or that a Discrete,
+        MultiDiscrete or MultiBinary space does not have.
         """
         values = observations
         if self.path != (OBSERVATION,) or isinstance(observations, (dict, tuple)):
@@ -171,18 +173,17 @@ class Part:
             if self._is_bytes:
                 return np.require(values, np.uint8, WRITABLE)
             low, high = self.bounds
-            return finite(np.require((values - low) / ((high - low) or 1.0), np.float32, WRITABLE))
+            within(finite(values), low, high)
+            return np.require((values - low) / ((high - low) or 1.0), np.float32, WRITABLE)
         rows = np.reshape(values, (len(values), -1))
         if isinstance(self.leaf, (gym.spaces.Discrete, gym.spaces.MultiDiscrete)):
             first = np.ravel(self.leaf.start).astype(np.int64)
             sizes = np.ravel(self.leaf.n if isinstance(self.leaf, gym.spaces.Discrete) else self.leaf.nvec)
             sizes = sizes.astype(np.int64)
-            wrong = (rows < first) | (rows >= first + sizes)
-            if wrong.any():
-                row, entry = np.argwhere(wrong)[0].tolist()
-                last = first[entry] + sizes[entry] - 1
-                raise WrongValue(row, f"is {rows[row, entry]}, outside of {first[entry]} to {last}")
+            within(rows, first, first + sizes - 1)
             return one_hot(rows - first, sizes)
+        if isinstance(self.leaf, gym.spaces.MultiBinary):
+            within(rows, 0, 1)
         with np.errstate(over="ignore"):
             return finite(np.require(rows, np.float32, WRITABLE))
 
@@ -228,6 +229,15 @@ def finite(values: np.ndarray) -> np.ndarray:
         index = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
         raise WrongValue(index[0], f"has an entry {values[index]}")
     return values
+
+
+def within(values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> None:
+    """Raise WrongValue if one of the values (n, ...) is below low or above high, numbers or of a row's shape."""
+    wrong = (values < low) | (values > high)
+    if wrong.any():
+        index = tuple(np.argwhere(wrong)[0].tolist())
+        low, high = (np.broadcast_to(bound, values.shape)[index] for bound in (low, high))
+        raise WrongValue(index[0], f"is {values[index]}, outside of {low} to {high}")
 
 
 def rows_of(observations: Any, rows: np.ndarray) -> Any:

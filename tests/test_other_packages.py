@@ -225,6 +225,8 @@ WRONG = [
     (gym.spaces.Discrete(5, start=2), 7, "observation is 7, outside of 2 to 6"),
     (NUMBER, np.array([np.nan], np.float32), "observation has an entry nan"),
     (box(-1, 1, (40, 40, 3)), np.full((40, 40, 3), np.inf, np.float32), "observation has an entry inf"),
+    (box(0, 1, (40, 40, 3)), np.full((40, 40, 3), 7, np.float32), r"observation is 7\.0, outside of 0\.0 to 1\.0"),
+    (gym.spaces.MultiBinary(2), np.array([0, 5], np.int8), "observation is 5, outside of 0 to 1"),
     (gym.spaces.Dict({"a": gym.spaces.Tuple((gym.spaces.Discrete(2),))}), {"a": (2,)}, r"a\.0 is 2, outside of 0 to 1"),
 ]
 
@@ -248,15 +250,24 @@ def test_a_wrong_observation_is_one_line(space, wrong, message, last):
 @EACH_SCRIPT
 @pytest.mark.parametrize("what", ["observation", "reward"])
 def test_a_training_stops_before_what_is_not_finite(tiny, script, what):
-    """The line names the last good checkpoint; the learning rate has nothing to do with it."""
-    bad = lambda env: env.number == 2 and env.episode == 8 and env.t == 1  # noqa: E731
-    see = lambda env: np.array([np.nan if bad(env) and what == "observation" else 0.0], np.float32)  # noqa: E731
-    earn = lambda env: np.inf if bad(env) and what == "reward" else 1.0  # noqa: E731
+    """The line names the level, and the last good checkpoint; the learning rate has nothing to do with it."""
+    levels = []
+
+    def bad(env, now):
+        if not (env.number == 2 and env.episode == 8 and env.t == 1 and what == now):
+            return False
+        levels.append(env.seeds[-1])
+        return True
+
+    see = lambda env: np.array([np.nan if bad(env, "observation") else 0.0], np.float32)  # noqa: E731
+    earn = lambda env: np.inf if bad(env, "reward") else 1.0  # noqa: E731
     args = tiny(script, env_id=small(count=itertools.count(), see=see, earn=earn), checkpoint_interval=1)
     with pytest.raises(RunError) as error:
         script.main(args)
     says = "observation has an entry nan" if what == "observation" else "the reward is inf"
-    assert f"iteration 2: {args.env_id}: {says} (environment 2, step 22 since its reset with seed " in str(error.value)
+    where = f"environment 2, step 1 since its reset with seed {levels[0]}"
+    assert f"iteration 2: {args.env_id}: {says} ({where})" in str(error.value)
+    assert 0 <= levels[0] < args.num_levels
     assert "the last checkpoint is runs/" in str(error.value)
     assert "checkpoint-64.pt" in str(error.value)
     assert "init-lr" not in str(error.value)
@@ -572,6 +583,7 @@ def test_a_small_type_holds_its_values():
 
 
 SHAPES = [
+    (box(0, 255, (2,), np.uint8), np.array([300, 0], np.uint16), "observation has an entry 300, outside of 0 to 255"),
     (NUMBER, np.zeros(2, np.float32), r"observation is of float32, shape \(2,\), and its space float32, \(1,\)"),
     (PICTURE, np.zeros((40, 48, 3)), r"observation is of float64, shape \(40, 48, 3\), and its space uint8"),
     (gym.spaces.Dict({"a": gym.spaces.Tuple((NUMBER, NUMBER))}), {"a": (np.zeros(1),)}, r"observation\.a has no 1: "),
@@ -584,9 +596,11 @@ SHAPES = [
 def test_an_observation_of_another_shape(space, wrong, message, asynchronous):
     see = lambda env: wrong if env.t == 2 else right  # noqa: E731
     right = space.sample()
-    envs = make_envs(small(space=space, see=see), 2, seed=1, asynchronous=asynchronous)
+    env_id = small(space=space, see=see)
+    envs = make_envs(env_id, 2, seed=1, asynchronous=asynchronous)
     envs.reset()
-    with pytest.raises(RuntimeError, match=r"environment \d raised ValueError in step 2 since .*: " + message):
+    where = r"environment \d, step 2 since its reset with seed \d+"
+    with pytest.raises(RunError, match=rf"^{env_id}: {message}.* \({where}\)$"):
         list(roll(envs, 3))
     envs.close()
 
@@ -597,11 +611,12 @@ def test_a_reward_is_one_number(asynchronous):
     envs.reset()
     assert next(roll(envs, 1))[1].tolist() == [0.25, 0.25]
     envs.close()
-    envs = make_envs(small(earn=lambda env: np.zeros(2)), 2, seed=1, asynchronous=asynchronous)
-    envs.reset()
-    with pytest.raises(RuntimeError, match=r"environment \d raised ValueError in step 1 .*: the reward is"):
-        list(roll(envs, 1))
-    envs.close()
+    for wrong in (np.zeros(2), None, 1j):
+        envs = make_envs(small(earn=lambda env, wrong=wrong: wrong), 2, seed=1, asynchronous=asynchronous)
+        envs.reset()
+        with pytest.raises(RunError, match=r"the reward is .*, not a number \(environment \d, step 1 since its reset"):
+            list(roll(envs, 1))
+        envs.close()
 
 
 def test_a_process_that_dies():

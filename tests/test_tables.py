@@ -218,18 +218,24 @@ def test_the_table_of_minutes_is_printed_by_its_command(capsys):
 
 
 def test_speeds_are_measured(tmp_path, monkeypatch):
-    """Of all agents, in turn; here with trainings of an iteration."""
-    monkeypatch.setattr(tuning, "SPEEDS", tmp_path / "speeds.csv")
+    """Of all agents of a task, in turn; other tasks keep theirs. Here with trainings of an iteration."""
+    speeds = tmp_path / "speeds.csv"
+    kept = [f"SearingSpotlights-v0,{','.join(key)},7" for key in tuning.AGENTS]
+    old = [f"MortarMayhem-Grid-v0,{','.join(key)},0" for key in reversed(tuning.AGENTS)]
+    speeds.write_text("\n".join(["task,script,preset,steps_per_second", *kept, *old]))
+    monkeypatch.setattr(tuning, "SPEEDS", speeds)
     monkeypatch.setattr(tuning, "STEPS", 256)
-    monkeypatch.setattr(tuning, "LAPTOP", ["MortarMayhem-Grid-v0"])
     small = " --num-envs 4 --num-steps 32 --num-minibatches 2"
     monkeypatch.setattr(
         tuning, "AGENTS", {key: (suite, agent + small) for key, (suite, agent) in tuning.AGENTS.items()}
     )
-    tuning.measure_speeds()
-    head, *rows = (tmp_path / "speeds.csv").read_text().splitlines()
+    tuning.measure_speeds(("MortarMayhem-Grid-v0",))
+    head, *rows = speeds.read_text().splitlines()
     assert head == "task,script,preset,steps_per_second"
-    assert [row.rpartition(",")[0] for row in rows] == [
+    assert {row.rpartition(",")[0] for row in rows[:4]} == {
         f"MortarMayhem-Grid-v0,{','.join(key)}" for key in tuning.AGENTS
-    ]
-    assert all(int(row.rpartition(",")[2]) > 0 for row in rows)
+    }
+    assert all(int(row.rpartition(",")[2]) > 0 for row in rows[:4])
+    assert rows[4:] == kept
+    with pytest.raises(SystemExit, match="there is no 'mortar-mayhem'; there are MortarMayhem"):
+        tuning.measure_speeds(("mortar-mayhem",))
