@@ -207,7 +207,7 @@ def check_fits(space: gym.Space, observation: Any, name: str = "observation") ->
             raise UnfitError(
                 f"{name} is of {array.dtype}, shape {array.shape}, and its space {space.dtype}, {space.shape}"
             )
-        if space.dtype.kind in "iu" and not np.can_cast(array.dtype, space.dtype):  # too large numbers would wrap around
+        if space.dtype.kind in "iu" and not np.can_cast(array.dtype, space.dtype):  # numbers might wrap around
             least, most = np.iinfo(space.dtype).min, np.iinfo(space.dtype).max
             wrong = array[(array < least) | (array > most)]
             if wrong.size:
