@@ -30,7 +30,7 @@ from ppo_utils.checkpoints import import_script, load_weights, make_agent, read_
 from ppo_utils.environments import as_tensors, envs_for, final_numbers, is_memory_gym, with_options, wrappers_of
 from ppo_utils.evaluation import first_unseen
 from ppo_utils.processes import RunError
-from ppo_utils.video import as_picture, check_draws
+from ppo_utils.video import as_image, check_draws
 
 try:
     from PIL import Image
@@ -166,7 +166,7 @@ def play(
     """Play one episode, or max_steps of it, in the only lane of `envs`, with an empty memory.
 
     deterministic: take the most probable actions. stacked: whether the images that the agent gets are stacks of
-    grayscale ones. Raises ValueError if there are no pictures, and RunError as the environment does.
+    grayscale ones. Raises ValueError if there are no images, and RunError as the environment does.
     """
     torch.manual_seed(seed)
     family = family_of(envs.spec.id)
@@ -255,8 +255,8 @@ def rendered(envs: gym.vector.VectorEnv, mode: str) -> np.ndarray:
     envs.unwrapped.render_mode = mode  # a Memory Gym environment draws in both, whichever it was made with
     frames = envs.render()
     if frames is None or frames[0] is None:
-        raise ValueError(f"{envs.spec.id} draws no pictures (render_mode {mode}); there would be nothing to watch")
-    image = Image.fromarray(as_picture(frames[0]))
+        raise ValueError(f"{envs.spec.id} draws no images (render_mode {mode}); there would be nothing to watch")
+    image = Image.fromarray(as_image(frames[0]))
     image.thumbnail((LARGEST, LARGEST))
     return np.asarray(image)
 
@@ -349,7 +349,7 @@ def page(data: dict[str, Any], plotly: str) -> str:
 
 # ---- MAIN ----
 def load(path: str, env_options: str | None = None) -> tuple[nn.Module, gym.vector.VectorEnv, Any]:
-    """Return the agent in the file, one lane of its environment that draws pictures, and its training's arguments.
+    """Return the agent in the file, one lane of its environment that draws images, and its training's arguments.
 
     env_options: JSON, over those of the training. Raises ValueError, OSError, ImportError, gymnasium.error.Error or
     RunError, each with one line for the user.

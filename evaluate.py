@@ -394,8 +394,6 @@ def with_defaults(given: dict[str, str]) -> dict[str, str]:
 
     An argument that is newer than the run has its default, one that no longer exists is left out.
     """
-    if given.get("norm_adv") in ("True", "False"):  # before it was a choice
-        given = given | {"norm_adv": "minibatch" if given["norm_adv"] == "True" else "none"}
     name = given.get("script", "ppo_trxl" if "trxl_dim" in given else "ppo_gru")  # an older run does not say it
     try:
         defaults = asdict(import_script({"script": name}, name).Args())

@@ -57,7 +57,7 @@ class Args:
     exp_name: str = Path(__file__).stem
     """name of the experiment, part of the run folder's name"""
     preset: Literal["thesis", "laptop", "quickstart"] = "thesis"
-    """a set of defaults, listed above; explicit flags override it"""
+    """a set of defaults, listed above; explicit flags override it (in Python: Args(**PRESETS["laptop"]))"""
     seed: NonNegativeInt = 1
     """seed of weights, actions and environments; on a CPU with as many threads, a run is repeated bit for bit"""
     torch_deterministic: bool = True
@@ -135,11 +135,11 @@ class Args:
     max_grad_norm: PositiveFloat = 0.25
     """largest norm of the gradient, which is scaled down to it"""
     target_kl: PositiveFloat | None = None
-    """stop the update at a minibatch on which the approximate KL divergence from the old policy is larger"""
+    """stop the update at a minibatch on which the approximate KL divergence from the old policy is larger (above 0)"""
     optimizer: Literal["adamw", "muon"] = "adamw"
     """muon: Muon for the matrices between hidden layers, AdamW for all other weights"""
-    muon_lr_ratio: PositiveFloat = 3.0
-    """learning rate of Muon, in multiples of AdamW's, which --init-lr and --final-lr are"""
+    muon_lr_ratio: bounded(float, 0, 1000, above=True) = 3.0
+    """learning rate of Muon, in multiples of AdamW's (--init-lr, --final-lr)"""
     init_lr: UnitInterval = 2.75e-4
     """initial learning rate"""
     final_lr: UnitInterval = 1.0e-5
@@ -170,7 +170,7 @@ class Args:
     eval_interval: NonNegativeInt = 0
     """iterations between evaluations on unseen levels, with another one at the end (0: no evaluations)"""
     eval_levels: PositiveInt = 50
-    """levels of an evaluation, the first that training does not use; each is played three times"""
+    """levels of an evaluation, the first after those of the training; each is played three times"""
     eval_max_steps: PositiveInt = 10_000
     """an evaluation cuts episodes off after this many steps"""
 
@@ -357,7 +357,7 @@ def collect(
 def update(
     agent: Agent, optimizers: list[torch.optim.Optimizer], rollout: Rollout, ent_coef: float, args: Args
 ) -> list[dict[str, Tensor]]:
-    """Learn from the rollout for some epochs; return what to log of each gradient step."""
+    """Learn from the rollout for some epochs; return what to log of each minibatch."""
     if args.norm_adv == "batch":
         rollout.advantages = normalize(rollout.advantages)
     rollout.first_occurrence = first_occurrences(rollout.obs)  # for speed: on a CPU, equal images are encoded once
@@ -368,7 +368,8 @@ def update(
             refresh_memory(agent, rollout, args)
         for minibatch in pieces.minibatches(args.num_minibatches):
             loss, logs = ppo_loss(agent, rollout, minibatch, ent_coef, args)
-            if args.target_kl is not None and step_logs:  # the first minibatch's is 0: nothing has been learned yet
+            step_logs.append(logs)
+            if args.target_kl is not None and len(step_logs) > 1:  # the first one's is 0: nothing has been learned yet
                 kl = np.mean(all_gather(logs["approx_kl"].item()))  # all processes stop together
                 if kl > args.target_kl:
                     return step_logs
@@ -378,7 +379,6 @@ def update(
             logs["grad_norm"] = clip_gradients(agent, args)
             for optimizer in optimizers:
                 optimizer.step()
-            step_logs.append(logs)
     return step_logs
 
 
@@ -451,17 +451,19 @@ def clip_gradients(agent: Agent, args: Args) -> Tensor:
 
 
 def mean_logs(step_logs: list[dict[str, Tensor]], rollout: Rollout) -> dict[str, float]:
-    """Return the means of what the gradient steps of an update logged.
+    """Return the means of what an update logged; the minibatch at which --target-kl ended it has no gradient norm.
 
     Raises FloatingPointError if a loss or a gradient was not finite: the weights are unusable then.
     """
-    losses = {name: torch.stack([logs[name] for logs in step_logs]).mean().item() for name in step_logs[0]}
+    values = {name: [logs[name] for logs in step_logs if name in logs] for name in step_logs[0]}
+    losses = {name: torch.stack(each).mean().item() for name, each in values.items()}
     if not (math.isfinite(losses["loss"]) and math.isfinite(losses["grad_norm"])):
         raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr, or smaller rewards")
     # Before the first gradient step, ratios differ from 1 by rounding only, if the update recomputes what acted.
     losses["ratio_error"] = step_logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
-    return {f"losses/{name}": value for name, value in losses.items()} | {"charts/gradient_steps": len(step_logs)}
+    gradient_steps = len(values["grad_norm"])
+    return {f"losses/{name}": value for name, value in losses.items()} | {"charts/gradient_steps": gradient_steps}
 
 
 # ---- 3 PPO ----
@@ -490,9 +492,9 @@ def gae(rollout: Rollout, last_value: Tensor, gamma: float, gae_lambda: float) -
 
 @dataclass
 class ReturnScale:
-    """Mean and variance of the discounted sum of an episode's rewards so far, of all steps (Engstrom et al., 2020).
+    """Mean and variance, over all steps, of the discounted sum of an episode's rewards (Engstrom et al., 2020).
 
-    Rewards are divided by its deviation; since no mean is subtracted, they keep their sign.
+    Rewards are divided by its deviation. No mean is subtracted, so that they keep their sign; nothing is clipped.
     """
 
     discounted: Tensor  # (N,) that sum in the present episodes
@@ -937,7 +939,7 @@ def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
 def setup(args: Args) -> Run:
     """Check the arguments and make all that a training needs, its files last, so that bad input raises before.
 
-    Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.
+    Raises ValueError, OSError, ImportError, RunError or gymnasium.error.Error, each with one line for the user.
     """
     script = Path(__file__).stem
     device, checkpoint = prepare(args, script, Memory.longest_piece(args))  # checkpoint: None without --resume

@@ -3,7 +3,7 @@
     flags          types of flags with bounds, their spelling, checks
     environments   any Gymnasium id, ready to train on
     lanes          environments side by side, each with seeds and errors of its own
-    observations   observations as pictures and vectors
+    observations   observations as images and vectors
     wrappers       what can be observed too: stacks, the step, the last action, Fourier features, spotlights
     video          videos of the first environment
     evaluation     scores on levels that are not trained on

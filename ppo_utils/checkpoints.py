@@ -253,20 +253,20 @@ def load_model(args: Any, agent: nn.Module, script: str) -> None:
 def load_learner(run: Run, saved: dict[str, Any], folder: str | Path) -> None:
     """Set the agent, the optimizers and what is counted to what a folder's checkpoint holds.
 
-    Raises ValueError if weights or optimizers do not fit, or if the checkpoint is of an older version.
+    Raises ValueError if weights or optimizers do not fit, or if the checkpoint is of another version.
     """
     load_weights(run.agent, saved, folder)
-    same_order = True  # of the weights, by which alone torch goes
-    for optimizer, state in zip(run.optimizers, saved.get("optimizers", [saved.get("optimizer")]), strict=True):
-        optimizer.load_state_dict(state)
-        for weight, moments in optimizer.state.items():
-            same_order &= all(moment.shape in (weight.shape, ()) for moment in moments.values())
-    memory = saved["processes"][rank_and_size()[0]]["memory"]
-    if not same_order or run.rollout.initial_memory.keys() - memory.keys():
+    try:
+        for optimizer, state in zip(run.optimizers, saved["optimizers"], strict=True):
+            optimizer.load_state_dict(state)
+        for process in saved["processes"]:
+            if process["memory"].keys() != run.rollout.initial_memory.keys() or "return_scale" not in process:
+                raise KeyError
+    except (KeyError, ValueError):
         raise ValueError(
-            f"{folder}: its checkpoint is of an older version, and training cannot go on from it; --load-model takes "
+            f"{folder}: its checkpoint is of another version, and training cannot go on from it; --load-model takes "
             "its weights"
-        )
+        ) from None
     run.step, run.seconds = saved["step"], saved["seconds"]
     run.returns.extend(saved["returns"])
     run.lengths.extend(saved["lengths"])
@@ -281,7 +281,7 @@ def load_process(run: Run, saved: dict[str, Any]) -> None:
     """
     rank, rollout = rank_and_size()[0], run.rollout
     state = saved["processes"][rank]
-    vars(rollout.return_scale).update(state.get("return_scale", {}))  # which older files do not have
+    vars(rollout.return_scale).update(state["return_scale"])
     rollout.return_scale.discounted = rollout.return_scale.discounted.to(rollout.values.device)
     random.setstate(state["python"])
     torch.set_rng_state(state["torch"])

@@ -103,7 +103,7 @@ def make_envs(
     num_levels, start_level: of Memory Gym environments. With a num_levels above 0, resets of others take one of the
         seeds start_level, start_level + 1, ..., num_levels of them, if they are made one by one, not as vector
         environments.
-    obs_type: of Memory Gym environments; others ignore it, with a line on stderr if they show pictures.
+    obs_type: of Memory Gym environments; others ignore it, with a line on stderr if they show images.
     render_mode: what render() draws; of other packages than this, always rgb_array.
     wrappers: arguments of `wrap_envs`.
 
@@ -133,9 +133,9 @@ def make_envs(
 
     try:
         envs = wrap_envs(envs, first_lane, **wrappers)
-        pictures = [name for name, part in envs.single_observation_space.items() if len(part.shape) == 3]
-        if obs_type == "vector" and pictures and not memory_gym:
-            print(f"{env_id} has no vectors to show instead of its {', '.join(pictures)}", file=sys.stderr)
+        images = [name for name, part in envs.single_observation_space.items() if len(part.shape) == 3]
+        if obs_type == "vector" and images and not memory_gym:
+            print(f"{env_id} has no vectors to show instead of its {', '.join(images)}", file=sys.stderr)
 
         if seed is not None:
             with one_line_errors(f"{env_id} cannot be reset"):
@@ -161,7 +161,7 @@ def wrap_envs(
 ) -> VectorEnv:
     """Wrap a vector environment with same-step autoreset, so that agents can observe it and act in it.
 
-    Observations are dicts of pictures and vectors, see `ObservationParts`; actions are integers (N, A), see
+    Observations are dicts of images and vectors, see `ObservationParts`; actions are integers (N, A), see
     `branch_actions`. first_lane: number of the first environment, for error messages. All else: see GrayscaleStack and
     VectorStack, StepEncoding, LastAction, SpotlightPerturbation, FourierFeatures. Raises ValueError for an environment
     that does not suit.
@@ -171,9 +171,9 @@ def wrap_envs(
         with one_line_errors("--spotlight-perturbation"):
             envs = SpotlightPerturbation(envs)
     if frame_stack:
-        pictures = any(len(part.shape) == 3 for part in envs.single_observation_space.values())
+        images = any(len(part.shape) == 3 for part in envs.single_observation_space.values())
         with one_line_errors("--frame-stack"):
-            envs = (GrayscaleStack if pictures else VectorStack)(envs, frame_stack)
+            envs = (GrayscaleStack if images else VectorStack)(envs, frame_stack)
     if step_encoding:
         envs = StepEncoding(envs)
     if observe_last_action:

@@ -9,6 +9,8 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from ppo_utils.processes import rank_and_size
 
+LARGEST = 3.4e38  # of weights: in float32, what is larger is infinite
+
 
 class Bounds(NamedTuple):
     """The numbers that a flag takes: low to high, both included unless `above`, which leaves out low."""
@@ -18,9 +20,9 @@ class Bounds(NamedTuple):
     above: bool = False
 
     def __str__(self) -> str:
-        if self.high == float("inf"):
+        if self.high >= LARGEST:
             return f"above {self.low}" if self.above else f"{self.low} or more"
-        return f"{self.low} to {self.high}"
+        return f"above {self.low} and at most {self.high}" if self.above else f"{self.low} to {self.high}"
 
     def include(self, number: float) -> bool:
         """Return whether a number is within the bounds; NaN never is."""
@@ -54,7 +56,7 @@ def is_whole(value: Any) -> bool:
 PositiveInt = bounded(int, 1)
 NonNegativeInt = bounded(int, 0)
 PositiveFloat = bounded(float, 0, above=True)
-NonNegativeFloat = bounded(float, 0)
+NonNegativeFloat = bounded(float, 0, LARGEST)
 UnitInterval = bounded(float, 0, 1)
 
 

@@ -1,6 +1,6 @@
-"""Observations of any environment as dicts of pictures and vectors, which is all that the networks take.
+"""Observations of any environment as dicts of images and vectors, which is all that the networks take.
 
-Shape letters: N environments, n some of them, H, W and C of a picture, V of a vector.
+Shape letters: N environments, n some of them, H, W and C of an image, V of a vector.
 """
 
 import sys
@@ -19,13 +19,13 @@ from ppo_utils.lanes import OWN, Place
 from ppo_utils.processes import RunError
 from ppo_utils.wrappers import OBSERVATION, one_hot
 
-SMALLEST_PICTURE = 36  # pixels along a side; what is smaller becomes a vector
+SMALLEST_IMAGE = 36  # pixels along a side; what is smaller becomes a vector
 WRITABLE = ("C_CONTIGUOUS", "WRITEABLE")  # wrappers overwrite observations in place
 INFOS = (OWN, "ground_truth", "_ground_truth", "final_obs", "_final_obs", "final_info", "_final_info")
 
 
 class ObservationParts(VectorWrapper):
-    """Every observation as a dict of named parts, in `final_obs` too: each a picture or a vector.
+    """Every observation as a dict of named parts, in `final_obs` too: each an image or a vector.
 
     Dicts and Tuples, at any depth, are taken apart; a part's name is the keys that lead to it, joined by dots. An
     observation that is neither is one part named "observation". Text is left out, and a line on stderr says so.
@@ -112,25 +112,25 @@ class WrongValue(Exception):
 
 @dataclass
 class Part:
-    """A part of the observation that is a picture or a vector: where it is, and how it is made."""
+    """A part of the observation that is an image or a vector: where it is, and how it is made."""
 
     path: tuple[str | int, ...]  # the keys that lead to it
     leaf: gym.Space  # of the environment
-    axes: tuple[int, int] | None = None  # height and width, if it is a picture
-    bounds: tuple[float, float] = (0, 1)  # of a picture's numbers
+    axes: tuple[int, int] | None = None  # height and width, if it is an image
+    bounds: tuple[float, float] = (0, 1)  # of an image's numbers
 
     @classmethod
     def of(cls, path: tuple[str | int, ...], leaf: gym.Space) -> "Part":
         """Say what becomes of a space that is no Dict or Tuple.
 
-        A Box with bounds and two neighbouring axes of at least 36 is a picture (H, W, C), with all other axes as
+        A Box with bounds and two neighbouring axes of at least 36 is an image (H, W, C), with all other axes as
         channels: uint8 if these are bytes from 0 to 255, else float32, scaled from its bounds to 0 to 1. All else is a
         vector (V,) float32, as Gymnasium's `flatten` makes it: Box, Discrete and MultiDiscrete (one-hot), MultiBinary.
 
-        Raises ValueError for other spaces, and for a picture without bounds.
+        Raises ValueError for other spaces, and for an image without bounds.
         """
         if isinstance(leaf, gym.spaces.Box):
-            axes = picture_axes(leaf.shape)
+            axes = image_axes(leaf.shape)
             if axes is None:
                 return cls(path, leaf)
             bounds = float(leaf.low.min()), float(leaf.high.max())
@@ -141,7 +141,7 @@ class Part:
         elif isinstance(leaf, (gym.spaces.Discrete, gym.spaces.MultiDiscrete, gym.spaces.MultiBinary)):
             return cls(path, leaf)
         raise ValueError(
-            f"the observation space {name_of(path)}: {brief(leaf)} is not supported; use pictures (height, width, "
+            f"the observation space {name_of(path)}: {brief(leaf)} is not supported; use images (height, width, "
             "channels) with bounds, Box, Discrete, MultiDiscrete, MultiBinary, and Tuple or Dict of these"
         )
 
@@ -151,7 +151,7 @@ class Part:
             flat = gym.spaces.flatten_space(self.leaf)
             with np.errstate(over="ignore"):  # bounds beyond float32 become infinite
                 return gym.spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32))
-        shape = self._as_picture(self.leaf.low[None]).shape[1:]
+        shape = self._as_image(self.leaf.low[None]).shape[1:]
         return gym.spaces.Box(0, 255, shape, np.uint8) if self._is_bytes else gym.spaces.Box(0, 1, shape, np.float32)
 
     @property
@@ -169,7 +169,7 @@ class Part:
             for key in self.path:
                 values = values[key]
         if self.axes is not None:
-            values = self._as_picture(np.asarray(values))
+            values = self._as_image(np.asarray(values))
             if self._is_bytes:
                 return np.require(values, np.uint8, WRITABLE)
             low, high = self.bounds
@@ -187,7 +187,7 @@ class Part:
         with np.errstate(over="ignore"):
             return finite(np.require(rows, np.float32, WRITABLE))
 
-    def _as_picture(self, values: np.ndarray) -> np.ndarray:
+    def _as_image(self, values: np.ndarray) -> np.ndarray:
         """Move height and width of (n, ...) to the front, and join all other axes as channels: (n, H, W, C)."""
         height, width = self.axes
         moved = np.moveaxis(values, (height + 1, width + 1), (1, 2))
@@ -212,12 +212,12 @@ def name_of(path: tuple[str | int, ...]) -> str:
     return ".".join(map(str, path))
 
 
-def picture_axes(shape: tuple[int, ...]) -> tuple[int, int] | None:
+def image_axes(shape: tuple[int, ...]) -> tuple[int, int] | None:
     """Return which axes are height and width, two neighbours of at least 36 pixels; None if there are none.
 
     A third large axis counts as channels if it comes last.
     """
-    large = [axis for axis, side in enumerate(shape) if side >= SMALLEST_PICTURE]
+    large = [axis for axis, side in enumerate(shape) if side >= SMALLEST_IMAGE]
     if len(shape) == len(large) == 3:
         large.pop()
     return tuple(large) if len(large) == 2 and len(shape) <= 4 and large[1] - large[0] == 1 else None

@@ -133,10 +133,13 @@ def seed_generators(seed: int) -> None:
 
 
 @contextlib.contextmanager
-def report_out_of_memory(args: Any, device: torch.device, space: gym.spaces.Dict | None = None) -> Iterator[None]:
-    """Raise ValueError if what is made inside does not fit in the memory, naming what is large.
+def report_out_of_memory(
+    args: Any, device: torch.device, space: gym.spaces.Dict | None = None, more: str | None = None
+) -> Iterator[None]:
+    """Raise RunError if what is made inside does not fit in the memory, naming what is large.
 
-    That are flags above their defaults, and the observation, of this space, if it takes megabytes.
+    Large are flags above their defaults, and an observation of this space if it takes megabytes. more: a flag of which
+    more would help.
     """
     try:
         yield
@@ -151,7 +154,8 @@ def report_out_of_memory(args: Any, device: torch.device, space: gym.spaces.Dict
         bytes_of = [part.dtype.itemsize * math.prod(part.shape) for part in space.values()] if space else []
         if sum(bytes_of) > 1e6:
             large = f"the observation, {sum(bytes_of) / 1e6:.0f} MB each time; or of {large}"
-        raise ValueError(f"this does not fit in the memory of {device}; use less of {large}") from None
+        large += f"; or more of {flag(more)} {getattr(args, more)}" if more else ""
+        raise RunError(f"this does not fit in the memory of {device}; use less of {large}") from None
 
 
 def open_run(args: Any, run: Run, checkpoint: dict[str, Any] | None) -> Run:
@@ -353,12 +357,14 @@ def stop_on_signals(run: Run) -> None:
 def run_to_end(args: Any, run: Run, train: Callable[[Any, Run], None]) -> Path:
     """Train until it is done or stopped; return the run folder.
 
-    With --save-model, what was learned is kept, unless the training diverged, a file could not be written or another
-    process ended. Raises FloatingPointError and RunError as `train` does, then with the last checkpoint's name.
+    With --save-model, what was learned is kept, unless the training diverged, it needed too much memory, a file could
+    not be written or another process ended. Raises FloatingPointError and RunError as `train` does, then with the last
+    checkpoint's name.
     """
     save_model = args.save_model
     try:
-        train(args, run)
+        with report_out_of_memory(args, run.rollout.values.device, more="num_minibatches"):
+            train(args, run)
         if run.writer is not None:
             with report_failed_write(run.folder):
                 run.writer.flush()
@@ -427,6 +433,8 @@ def command(
         run = setup(args)
     except (ValueError, OSError, ImportError, gym.error.Error, RunError) as error:
         fail(error)
+    except KeyboardInterrupt:
+        sys.exit(130)
     stop_on_signals(run)
     # If TensorBoard's thread fails to write, the next call to the writer raises here.
     threading.excepthook = lambda it: None if "tensorboard" in repr(type(it.thread)) else threading.__excepthook__(it)

@@ -58,21 +58,21 @@ class LaneVideo(Saved, VectorWrapper):
         super().close(**kwargs)
 
     def _film(self) -> None:
-        """Write lane 0's picture; Gymnasium's own method has all lanes draw theirs."""
+        """Write lane 0's image; Gymnasium's own method has all lanes draw theirs."""
         envs = self.unwrapped
         try:
             if isinstance(envs, MemoryGymVectorEnv):
                 (frame,) = envs.render(np.zeros(1, np.intp))
             else:
                 frame = envs.envs[0].render() if isinstance(envs, SyncVectorEnv) else envs.render()[0]
-            picture = as_picture(frame)
+            image = as_image(frame)
             if self.writer is None:
                 self.folder.mkdir(parents=True, exist_ok=True)
-                self.writer = video_writer(self.folder / f"episode-{self.episode}.mp4", picture.shape, self.fps)
-                self.shape = picture.shape
-            if picture.shape != self.shape:
-                raise ValueError(f"its pictures change their size, from {self.shape} to {picture.shape}")
-            self.writer.send(even(picture))
+                self.writer = video_writer(self.folder / f"episode-{self.episode}.mp4", image.shape, self.fps)
+                self.shape = image.shape
+            if image.shape != self.shape:
+                raise ValueError(f"its images change their size, from {self.shape} to {image.shape}")
+            self.writer.send(even(image))
             self.frames += 1
             if self.frames == MAX_VIDEO_FRAMES:
                 self._end()
@@ -88,7 +88,7 @@ class LaneVideo(Saved, VectorWrapper):
 
 
 def video_writer(path: Path, shape: tuple[int, ...], fps: float) -> Generator:
-    """Return what takes pictures of this shape, made `even`, and writes each as a frame of an H.264 video."""
+    """Return what takes images of this shape, made `even`, and writes each as a frame of an H.264 video."""
     imageio_ffmpeg = importlib.import_module("imageio_ffmpeg")  # of the extra `play`
     size = tuple(side + side % 2 for side in (shape[1], shape[0]))
     writer = imageio_ffmpeg.write_frames(str(path), size, fps=fps, macro_block_size=1, ffmpeg_log_level="error")
@@ -96,30 +96,30 @@ def video_writer(path: Path, shape: tuple[int, ...], fps: float) -> Generator:
     return writer
 
 
-def even(picture: np.ndarray) -> np.ndarray:
-    """Return a picture (H, W, 3) with even height and width, as H.264 needs: the last row and column are repeated."""
-    height, width, _ = picture.shape
-    return np.ascontiguousarray(np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))
+def even(image: np.ndarray) -> np.ndarray:
+    """Return an image (H, W, 3) with even height and width, as H.264 needs: the last row and column are repeated."""
+    height, width, _ = image.shape
+    return np.ascontiguousarray(np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))
 
 
-def as_picture(frame: Any) -> np.ndarray:
+def as_image(frame: Any) -> np.ndarray:
     """Return a rendered frame as bytes (H, W, 3): of bytes or of floats from 0 to 1, gray or in color, of a list too.
 
-    Raises ValueError for what is no picture.
+    Raises ValueError for what is no image.
     """
-    picture = np.asarray(frame) if frame is not None else np.zeros(0)
-    if picture.ndim == 2:
-        picture = picture[..., None]
-    if picture.ndim != 3 or picture.shape[2] not in (1, 3, 4) or 0 in picture.shape or picture.dtype.kind not in "biuf":
-        raise ValueError(f"render() returned no picture (height, width, 3), but {brief(frame)}")
-    if picture.dtype.kind in "bf" and picture.max() <= 1:
-        picture = picture * 255.0
-    picture = np.clip(np.nan_to_num(picture), 0, 255).astype(np.uint8)
-    return np.repeat(picture, 3, 2) if picture.shape[2] == 1 else picture[..., :3]
+    image = np.asarray(frame) if frame is not None else np.zeros(0)
+    if image.ndim == 2:
+        image = image[..., None]
+    if image.ndim != 3 or image.shape[2] not in (1, 3, 4) or 0 in image.shape or image.dtype.kind not in "biuf":
+        raise ValueError(f"render() returned no image (height, width, 3), but {brief(frame)}")
+    if image.dtype.kind in "bf" and image.max() <= 1:
+        image = image * 255.0
+    image = np.clip(np.nan_to_num(image), 0, 255).astype(np.uint8)
+    return np.repeat(image, 3, 2) if image.shape[2] == 1 else image[..., :3]
 
 
 def check_can_film(env_id: str) -> None:
-    """Raise ImportError without the extra `play`, ValueError if the environment says that it draws no pictures."""
+    """Raise ImportError without the extra `play`, ValueError if the environment says that it draws no images."""
     try:
         importlib.import_module("imageio_ffmpeg")
     except ImportError:
@@ -128,8 +128,8 @@ def check_can_film(env_id: str) -> None:
 
 
 def check_draws(what: str, env_id: str) -> None:
-    """Raise ValueError, which begins with what needs them, if the environment says that it draws no pictures."""
+    """Raise ValueError, which begins with what needs them, if the environment says that it draws no images."""
     spec = find_spec(env_id)
     metadata = getattr(creator(spec.entry_point or spec.vector_entry_point), "metadata", None)
     if metadata is not None and "rgb_array" not in metadata.get("render_modes", ()):
-        raise ValueError(f"{what} needs an environment that draws pictures (rgb_array); {spec.id} draws none")
+        raise ValueError(f"{what} needs an environment that draws images (rgb_array); {spec.id} draws none")

@@ -2,7 +2,7 @@
 
 They take any vector environment with same-step autoreset. Gymnasium's (1.4) own vector wrappers of observations refuse
 those, and it has no frame stack for vector environments at all.
-Shape letters: N lanes, n some of them, H and W of a picture, K frames of a stack, D width of an encoding, V of a
+Shape letters: N lanes, n some of them, H and W of an image, K frames of a stack, D width of an encoding, V of a
 vector, F frequencies, A action branches.
 """
 
@@ -42,7 +42,7 @@ class SameStepWrapper(Saved, VectorWrapper):
 
     The observation of a lane whose episode just ended is the wrapped first one of its next episode; `final_obs` holds
     the wrapped last one of the ended episode. `reset_mask` limits a reset to some lanes. Options, rewards, infos and
-    pictures of render() are the environment's. Raises ValueError for an environment without same-step autoreset.
+    images of render() are the environment's. Raises ValueError for an environment without same-step autoreset.
     """
 
     def __init__(self, env: VectorEnv):
@@ -50,15 +50,13 @@ class SameStepWrapper(Saved, VectorWrapper):
         if env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
             raise ValueError(f"{type(self).__name__} needs an environment with AutoresetMode.SAME_STEP, not {env}")
 
-    # ---- what a wrapper provides ----
+    # ---- what a wrapper provides: `wrap`, and the other two if it remembers something ----
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
         """Start new episodes in the lanes, (n,), with their first observations. seeds: one for every lane of N."""
-        raise NotImplementedError
 
     def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
         """Take in a step of all lanes and what they observe after it, before any reset."""
-        raise NotImplementedError
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
         """Return the lanes' observations, wrapped: fresh arrays where anything differs."""
@@ -96,19 +94,19 @@ class SameStepWrapper(Saved, VectorWrapper):
         self.single_observation_space, self.observation_space = space, batch_space(space, self.num_envs)
 
     def _add_part(self, name: str, part: gym.spaces.Box) -> None:
-        """Makes the space a Dict of the environment's own parts and this one."""
+        """Make the space a Dict of the environment's own parts and this one."""
         space = self.env.single_observation_space
         if name in named(space):
             raise ValueError(f"the observation already has a part {name!r}: {space}")
         self._set_space(gym.spaces.Dict({**named(space), name: part}))
 
 
-class PictureWrapper(SameStepWrapper):
-    """A wrapper that changes the picture in the observation: all of it, or the only picture in a Dict.
+class ImageWrapper(SameStepWrapper):
+    """A wrapper that changes the image in the observation: all of it, or the only image in a Dict.
 
-    channels: how many a picture may have.
+    channels: how many an image may have.
 
-    Raises ValueError for an observation without such a (H, W, channels) uint8 picture, or with several.
+    Raises ValueError for an observation without such a (H, W, channels) uint8 image, or with several.
     """
 
     channels: ClassVar[tuple[int, ...]] = (3,)
@@ -117,34 +115,34 @@ class PictureWrapper(SameStepWrapper):
         super().__init__(env)
         space = env.single_observation_space
         parts = named(space)
-        names = [name for name, part in parts.items() if self._is_picture(part)]
+        names = [name for name, part in parts.items() if self._is_image(part)]
         if len(names) != 1:
             shape = f"(H, W, {' or '.join(map(str, self.channels))})"
-            raise ValueError(f"{type(self).__name__} needs one {shape} uint8 picture to observe, not {space}")
+            raise ValueError(f"{type(self).__name__} needs one {shape} uint8 image to observe, not {space}")
         self.part = names[0]
-        self.picture_shape = parts[self.part].shape  # (H, W, channels)
+        self.image_shape = parts[self.part].shape  # (H, W, channels)
 
-    def picture(self, observations: Any) -> np.ndarray:
-        """Return the pictures of the observations, (n, H, W, channels)."""
+    def image(self, observations: Any) -> np.ndarray:
+        """Return the images of the observations, (n, H, W, channels)."""
         return named(observations)[self.part]
 
-    def replaced(self, whole: Any, picture: Any) -> Any:
-        """Return observations, or their space, with another picture."""
-        return {**named(whole), self.part: picture} if isinstance(whole, (dict, gym.spaces.Dict)) else picture
+    def replaced(self, whole: Any, image: Any) -> Any:
+        """Return observations, or their space, with another image."""
+        return {**named(whole), self.part: image} if isinstance(whole, (dict, gym.spaces.Dict)) else image
 
-    def _is_picture(self, space: gym.Space) -> bool:
+    def _is_image(self, space: gym.Space) -> bool:
         image = isinstance(space, gym.spaces.Box) and space.dtype == np.uint8
         return image and len(space.shape) == 3 and space.shape[2] in self.channels
 
 
-class GrayscaleStack(PictureWrapper):
-    """The last K pictures in grayscale instead of the last one in colour (thesis 6.2.1 has K = 4 and 16).
+class GrayscaleStack(ImageWrapper):
+    """The last K images in grayscale instead of the last one in colour (thesis 6.2.1 has K = 4 and 16).
 
-    env: pictures may be of any size, and gray already (H, W, 1). frames: K.
+    env: images may be of any size, and gray already (H, W, 1). frames: K.
     Observation: Box (H, W, K) uint8, the newest frame last; other parts of a Dict stay as they are. An episode begins
     with its first frame K times, as in the thesis' code and CleanRL's. Gray is 0.30 red + 0.59 green + 0.11 blue.
 
-    Raises ValueError for an environment without same-step autoreset or picture, and for K below 1.
+    Raises ValueError for an environment without same-step autoreset or image, and for K below 1.
     """
 
     channels = (1, 3)
@@ -152,7 +150,7 @@ class GrayscaleStack(PictureWrapper):
 
     def __init__(self, env: VectorEnv, frames: int = 4):
         super().__init__(env)
-        shape = (*self.picture_shape[:2], stack_size(frames))
+        shape = (*self.image_shape[:2], stack_size(frames))
         self.arguments = {"frames": shape[-1]}
         self._stack = np.zeros((self.num_envs, *shape), np.uint8)
         space = self.replaced(env.single_observation_space, gym.spaces.Box(0, 255, shape, np.uint8))
@@ -160,14 +158,14 @@ class GrayscaleStack(PictureWrapper):
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
         """Fill the lanes' stacks with their first frame."""
-        self._stack[lanes] = gray(self.picture(observations))[..., None]
+        self._stack[lanes] = gray(self.image(observations))[..., None]
 
     def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
-        """Puts a frame on each stack."""
+        """Put a frame on each stack."""
         # Every entry moves one place forward. What comes in from the next pixel is where the new frame goes.
         entries = self._stack.reshape(-1)
         entries[:-1] = entries[1:]
-        self._stack[..., -1] = gray(self.picture(observations))
+        self._stack[..., -1] = gray(self.image(observations))
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
         """Return the lanes' observations, with a copy of their stacks."""
@@ -175,7 +173,7 @@ class GrayscaleStack(PictureWrapper):
 
 
 class VectorStack(SameStepWrapper):
-    """The last K vectors instead of the last one, for vector observations as `GrayscaleStack` for pictures.
+    """The last K vectors instead of the last one, for vector observations as `GrayscaleStack` for images.
 
     frames: K. Of a Dict of vectors, each is stacked by itself.
     Observation: Box (K * V,), the newest vector last, or a Dict of such. An episode begins with its first vector K
@@ -207,7 +205,7 @@ class VectorStack(SameStepWrapper):
             self._stacks[name][lanes] = vectors[:, None]
 
     def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
-        """Puts a vector on each stack."""
+        """Put a vector on each stack."""
         for name, vectors in named(observations).items():
             stack = self._stacks[name]
             stack[:, :-1] = stack[:, 1:]
@@ -242,7 +240,7 @@ class StepEncoding(SameStepWrapper):
         self._add_part(STEP_ENCODING, gym.spaces.Box(-1.0, 1.0, (self.width,), np.float32))
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
-        """Sets the lanes' step numbers to 0."""
+        """Set the lanes' step numbers to 0."""
         self._steps[lanes] = 0
 
     def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
@@ -318,12 +316,6 @@ class FourierFeatures(SameStepWrapper):
         features = gym.spaces.Box(-1.0, 1.0, (entries * frequencies,), np.float32)
         self._set_space(gym.spaces.Dict({**parts, SINES: features, COSINES: features}, sort_keys=False))
 
-    def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
-        """Do nothing: features depend only on the present observation."""
-
-    def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
-        """Do nothing."""
-
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
         """Return the lanes' observations with the features of their vectors."""
         vectors = np.concatenate([named(observations)[name] for name in self._vectors], axis=1, dtype=np.float32)
@@ -331,27 +323,27 @@ class FourierFeatures(SameStepWrapper):
         return {**named(observations), SINES: np.sin(angles), COSINES: np.cos(angles)}
 
 
-class SpotlightPerturbation(PictureWrapper):
-    """A translucent layer over the picture with moving holes, the spotlights of Searing Spotlights (thesis 7.2).
+class SpotlightPerturbation(ImageWrapper):
+    """A translucent layer over the image with moving holes, the spotlights of Searing Spotlights (thesis 7.2).
 
     The defaults are those of the author's code (neroRL): a white layer of opacity 120, and spotlights that have gone
     30 % of their way when an episode begins, so that the first observation is perturbed too. A Searing Spotlights
-    environment, which gets no actions from the agent, computes them; they change nothing but the picture.
+    environment, which gets no actions from the agent, computes them; they change nothing but the image.
 
-    env: pictures must be 84 x 84. opacity: of the veil, of 255. shade: its gray level, 255 white, 0 black.
+    env: images must be 84 x 84. opacity: of the veil, of 255. shade: its gray level, 255 white, 0 black.
     lights: any of the Searing Spotlights options in LIGHTS. With the default ones no spotlight appears after step 1,200
         of an episode; a larger num_spawns has them go on.
     Observation: as before, Box (84, 84, 3) uint8 or a Dict with one.
     Each lane has a generator of its own for the spotlights, which reset(seed) seeds, apart from the environment's; it
     goes on from episode to episode.
 
-    Raises ValueError for an environment without same-step autoreset or such a picture, and for other arguments.
+    Raises ValueError for an environment without same-step autoreset or such an image, and for other arguments.
     """
 
     def __init__(self, env: VectorEnv, opacity: int = 120, shade: int = 255, lights: Mapping[str, Any] | None = None):
         super().__init__(env)
-        if self.picture_shape != (SCREEN, SCREEN, 3):
-            raise ValueError(f"SpotlightPerturbation needs {SCREEN} x {SCREEN} pixels, not {self.picture_shape}")
+        if self.image_shape != (SCREEN, SCREEN, 3):
+            raise ValueError(f"SpotlightPerturbation needs {SCREEN} x {SCREEN} pixels, not {self.image_shape}")
         for name, value in (("opacity", opacity), ("shade", shade)):
             if not isinstance(value, (int, np.integer)) or not 0 <= value <= 255:
                 raise ValueError(f"{name} must be an integer from 0 to 255, not {value!r}")
@@ -389,7 +381,7 @@ class SpotlightPerturbation(PictureWrapper):
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
         """Return the lanes' observations, with the veil wherever no spotlight is."""
-        frames = self.picture(observations).reshape(-1, FRAME)  # (n, FRAME)
+        frames = self.image(observations).reshape(-1, FRAME)  # (n, FRAME)
         bits, _ = light_masks(self._light.state, spot_stencils(*self._radii), lanes)
         veiled = frames * self.clear
         veiled += self.veil
@@ -399,7 +391,7 @@ class SpotlightPerturbation(PictureWrapper):
         veiled ^= frames
         veiled &= ~pixels(bits)
         veiled ^= frames
-        return self.replaced(observations, veiled.reshape(-1, *self.picture_shape))
+        return self.replaced(observations, veiled.reshape(-1, *self.image_shape))
 
 
 def named(observation: Any) -> dict[str, Any]:
@@ -413,7 +405,7 @@ def branch_sizes(space: gym.Space) -> np.ndarray:
     """Return the number of actions of each branch, (A,); raise ValueError unless Discrete or MultiDiscrete."""
     if isinstance(space, gym.spaces.Discrete):
         return np.array([space.n])
-    if isinstance(space, gym.spaces.MultiDiscrete) and space.nvec.ndim == 1:
+    if isinstance(space, gym.spaces.MultiDiscrete) and space.nvec.ndim == 1 and space.nvec.size:
         return space.nvec
     raise ValueError(f"the action space {brief(space)} is not supported; use Discrete or one-dimensional MultiDiscrete")
 

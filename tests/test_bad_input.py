@@ -20,6 +20,7 @@ from ppo_utils import runs
 from ppo_utils.checkpoints import make_agent
 from ppo_utils.environments import envs_for
 from ppo_utils.flags import check_args, check_minibatches
+from ppo_utils.processes import RunError
 
 SCRIPT = os.path.abspath(ppo_gru.__file__)
 CASES = {
@@ -47,8 +48,10 @@ CASES = {
     "--num-minibatches 200 --seq-len 100": "may have only 163 sequences",
     "--seed 99999999999999999999": r"--seed is 99999999999999999999; it must be below 2 \*\* 63",
     "--exp-name ../up": "--exp-name is '../up'; it must be a name without slashes",
-    "--env-id CueRecall-v0 --capture-video": "needs an environment that draws pictures .*; CueRecall-v0 draws none",
+    "--env-id CueRecall-v0 --capture-video": "needs an environment that draws images .*; CueRecall-v0 draws none",
     "--target-kl nan": "--target-kl is nan; it must be above 0",
+    "--vf-coef inf": "--vf-coef is inf; it must be 0 or more",
+    "--muon-lr-ratio inf": "--muon-lr-ratio is inf; it must be above 0 and at most 1000",
     "--ground-truth-detach": "--ground-truth-detach needs --ground-truth-coef above 0",
     "--memory none --seq-len 5": "--seq-len, --num-layers and --refresh-memory need --memory gru or lstm",
     "--memory none --refresh-memory": "--refresh-memory need --memory gru or lstm",
@@ -77,7 +80,7 @@ def run(flags, cwd):
 def setup_error(args, script=ppo_gru):
     """What a setup that fails says."""
     before = os.path.exists("runs") and os.listdir("runs")
-    with pytest.raises((ValueError, OSError, ImportError, gym.error.Error)) as error:
+    with pytest.raises((ValueError, OSError, ImportError, RunError, gym.error.Error)) as error:
         script.setup(args)
     assert (os.path.exists("runs") and os.listdir("runs")) == before, "nothing half-written"
     return str(error.value)
@@ -157,6 +160,31 @@ def test_what_does_not_fit(tiny, monkeypatch, error):
     changes = {"num_envs": 128, "frame_stack": 7, "total_timesteps": 4096, "checkpoint_interval": 100}
     message = setup_error(tiny(env_id="CueRecall-v0", update_epochs=9, **changes))
     assert message == "this does not fit in the memory of cpu; use less of --frame-stack 7 --num-envs 128"
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_an_update_that_does_not_fit(tiny, monkeypatch, script):
+    def full(*_):
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes")
+
+    monkeypatch.setattr(script, "ppo_loss", full)
+    args = tiny(script, env_id="CueRecall-v0", num_minibatches=2, save_model=True)
+    says = (
+        r"^iteration 1: this does not fit in the memory of cpu; use less of .*; or more of --num-minibatches 2; there"
+    )
+    with pytest.raises(RunError, match=says):
+        script.main(args)
+    assert not glob.glob("runs/*/model.pt*")
+
+
+def test_ctrl_c_while_it_is_set_up(monkeypatch):
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "argv", ["ppo_gru.py"])
+    with pytest.raises(SystemExit) as ended:
+        runs.command(ppo_gru.Args, ppo_gru.PRESETS, interrupted, ppo_gru.train)
+    assert ended.value.code == 130
 
 
 def test_a_defect_is_told_as_one(tiny, monkeypatch):

@@ -412,7 +412,7 @@ def test_pictures_of_every_kind(frame, odd):
 
 def test_no_pictures(odd):
     odd()
-    with pytest.raises(ValueError, match=r"Odd-v0 draws no pictures \(render_mode rgb_array\)"):
+    with pytest.raises(ValueError, match=r"Odd-v0 draws no images \(render_mode rgb_array\)"):
         page_of()
 
 
@@ -804,7 +804,7 @@ def test_bad_input(config, message, saved):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"env_id": "CueRecall-v0"}, r"enjoy\.py needs .* that draws pictures \(rgb_array\); CueRecall-v0 draws none"),
+        ({"env_id": "CueRecall-v0"}, r"enjoy\.py needs .* that draws images \(rgb_array\); CueRecall-v0 draws none"),
         ({"env_options": '{"agent_scal": 1}'}, "agent_scal.*agent_scale"),
         ({"obs_type": "vector"}, "holds the weights of another network"),
     ],

@@ -645,7 +645,7 @@ CASES = [
     ("nowhere:Env-v0", {}, "nowhere"),
     ("Pendulum-v1", {}, r"action space Box.* is not supported; use Discrete or one-dimensional MultiDiscrete"),
     (shows(NUMBER, action_space=gym.spaces.MultiDiscrete([[2, 2]])), {}, "action space .* is not supported"),
-    (shows(GRAPH), {}, "observation space observation: Graph.* is not supported; use pictures"),
+    (shows(GRAPH), {}, "observation space observation: Graph.* is not supported; use images"),
     (shows(gym.spaces.Sequence(NUMBER)), {}, "observation space observation: Sequence.* is not supported"),
     (shows(gym.spaces.Dict({"a.b": NUMBER, "a": gym.spaces.Dict({"b": NUMBER})})), {}, "two parts have the same name"),
     (
@@ -655,10 +655,10 @@ CASES = [
     ),
     (shows(gym.spaces.OneOf((NUMBER, NUMBER))), {}, "observation: OneOf.* is not supported"),
     (shows(gym.spaces.Text(3)), {}, "Text.* is not supported; it is all text"),
-    (shows(box(-np.inf, 1, (40, 40, 3))), {}, "Box.* is not supported; use pictures .* with bounds"),
-    (shows(box(0, 1, (40, 40, 3))), {"frame_stack": 4}, "--frame-stack: .* uint8 picture"),
+    (shows(box(-np.inf, 1, (40, 40, 3))), {}, "Box.* is not supported; use images .* with bounds"),
+    (shows(box(0, 1, (40, 40, 3))), {"frame_stack": 4}, "--frame-stack: .* uint8 image"),
     ("MysteryPath-v0", {"frame_stack": -1}, "--frame-stack: frames must be an integer of at least 1, not -1"),
-    ("CartPole-v1", {"spotlight_perturbation": True}, "--spotlight-perturbation: .* picture"),
+    ("CartPole-v1", {"spotlight_perturbation": True}, "--spotlight-perturbation: .* image"),
     (
         shows(box(0, 255, (90, 84, 3), np.uint8)),
         {"spotlight_perturbation": True},
@@ -786,7 +786,7 @@ def test_other_autoreset_is_refused():
 
 
 def test_videos_need_the_extra_and_pictures(monkeypatch):
-    with pytest.raises(ValueError, match=r"--capture-video needs .* draws pictures .*CueRecall-v0 draws none"):
+    with pytest.raises(ValueError, match=r"--capture-video needs .* draws images .*CueRecall-v0 draws none"):
         check_can_film("CueRecall-v0")
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ImportError, match=r'--capture-video needs imageio-ffmpeg: pip install -e "\.\[play\]"'):

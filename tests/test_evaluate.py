@@ -333,13 +333,13 @@ def test_evaluations_are_shown_before_training_episodes(agents):
 def test_the_arguments_of_an_older_run():
     """What it could not say has the default, so that it still counts as a seed of the same agent."""
     with SummaryWriter("old") as writer:
-        rows = "|seed|3|\n|num_envs|4|\n|no_longer|1|\n|env_id|A-v0|\n|norm_adv|True|"
+        rows = "|seed|3|\n|num_envs|4|\n|no_longer|1|\n|env_id|A-v0|\n|head_size|7|"
         writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
         writer.add_scalar("eval/return", float("nan"), 5)
         writer.add_scalar("eval/return", 2.0, 10)
     run = evaluate.read_run("old")
     defaults = {name: str(value) for name, value in asdict(ppo_gru.Args()).items()}
-    changed = {"script": "ppo_gru", "seed": "3", "num_envs": "4", "env_id": "A-v0", "norm_adv": "minibatch"}
+    changed = {"script": "ppo_gru", "seed": "3", "num_envs": "4", "env_id": "A-v0", "trunk_size": "7"}
     assert run.args == defaults | changed
     assert [each.tolist() for each in run.curves["eval/return"]] == [[10], [[[2]]]]
 

@@ -131,13 +131,15 @@ def test_a_gradient_step_is_no_longer_than_its_norm_allows(played, max_grad_norm
             assert step.item() == pytest.approx(min(max_grad_norm, logs["grad_norm"].item()), rel=1e-3)
 
 
-def test_logs_are_means_over_gradient_steps():
+def test_logs_are_means_over_minibatches():
+    """Of the last one, --target-kl ended the update before its gradient step."""
     steps = [{"loss": 1.0, "grad_norm": 2.0, "ratio_error": 0.25}, {"loss": 4.0, "grad_norm": 6.0, "ratio_error": 9.0}]
+    steps.append({"loss": 10.0, "ratio_error": 1.0})
     steps = [{name: torch.tensor(value) for name, value in step.items()} for step in steps]
     values = torch.tensor([[0.0], [1.0]])
     found = ppo_gru.mean_logs(steps, SimpleNamespace(values=values, returns=values))
     assert found == {
-        "losses/loss": 2.5,
+        "losses/loss": 5.0,
         "losses/grad_norm": 4.0,
         "losses/ratio_error": 0.25,  # before the first gradient step
         "losses/explained_variance": 1.0,

@@ -20,7 +20,7 @@ import ppo_gru
 from ppo_utils import environments, evaluation, runs
 from ppo_utils.environments import env_actions, envs_for, final_numbers, find_spec, ground_truth_of, make_envs
 from ppo_utils.processes import RunError
-from ppo_utils.video import LaneVideo, as_picture, even, video_writer
+from ppo_utils.video import LaneVideo, as_image, even, video_writer
 
 EACH_SCRIPT = pytest.mark.parametrize("script", SCRIPTS)
 NUMBER = box(-np.inf, np.inf, (1,))
@@ -428,7 +428,7 @@ def test_every_step_is_in_the_video_once_and_in_order(first, tmp_path):
         path, writer = tmp_path / "some.mp4", None
         writer = video_writer(path, (16, 128, 3), fps)
         for number in range(length):
-            writer.send(even(as_picture(marked(number))))
+            writer.send(even(as_image(marked(number))))
         writer.close()
         assert marks_in(path) == [*range(length)], (length, fps)
 
@@ -460,15 +460,15 @@ FRAMES = {
 
 @pytest.mark.parametrize("name", FRAMES)
 def test_every_picture_is_one_of_bytes(name):
-    picture = as_picture(FRAMES[name])
+    picture = as_image(FRAMES[name])
     assert (picture.dtype, picture.shape) == (np.uint8, (6, 8, 3))
     assert np.array_equal(picture[..., 1], GRAY)
 
 
 @pytest.mark.parametrize("frame", [None, [], "text", np.zeros((3, 4, 5)), np.zeros((0, 4)), np.zeros(4), [None]])
 def test_what_is_no_picture(frame):
-    with pytest.raises(ValueError, match=r"render\(\) returned no picture"):
-        as_picture(frame)
+    with pytest.raises(ValueError, match=r"render\(\) returned no image"):
+        as_image(frame)
 
 
 DRAWS = {
@@ -492,7 +492,7 @@ def test_a_large_observation_is_named_where_memory_is_short(tiny):
     large, small = gym.spaces.Dict({"a": box(0, 1, (10**7,))}), gym.spaces.Dict({"a": NUMBER})
     for space, named in ((large, "the observation, 40 MB each time; or of --num-envs 64"), (small, "--num-envs 64")):
         with (
-            pytest.raises(ValueError, match=f"does not fit in the memory of cpu; use less of {named}$"),
+            pytest.raises(RunError, match=f"does not fit in the memory of cpu; use less of {named}$"),
             runs.report_out_of_memory(tiny(num_envs=64), torch.device("cpu"), space),
         ):
             raise MemoryError

@@ -384,27 +384,23 @@ def test_a_folder_that_cannot_be_written(trained, monkeypatch):
         resumed(ppo_gru, trained)
 
 
-def test_a_checkpoint_with_the_weights_in_another_order(trained):
-    path = trained / "checkpoint-128.pt"
-    saved = read_model(path)
-    (optimizer,) = saved["optimizers"]
-    moments = optimizer["state"]
-    optimizer["state"] = {i: moments[(i + 1) % len(moments)] for i in moments}
-    torch.save(saved, path)
-    with pytest.raises(ValueError, match=r"is of an older version, .*; --load-model takes its weights"):
-        resumed(ppo_gru, trained, "--total-timesteps", "256")
-
-
-def test_a_checkpoint_with_another_memory_s_state(tiny, tmp_path):
-    """As a transformer's was before: the whole rollout, by other names."""
+@pytest.mark.parametrize("missing", ["memory", "return_scale", "optimizers", "optimizer"])
+def test_a_checkpoint_of_another_version(tiny, missing):
     folder = ppo_trxl.main(tiny(ppo_trxl, **GRID, capture_video=False))
     path = folder / "checkpoint-128.pt"
     saved = read_model(path)
-    memory = saved["processes"][0]["memory"]
-    saved["processes"][0]["memory"] = {"items": memory["hidden"], "episode_step": memory["episode_step"]}
+    if missing == "memory":  # a transformer's was before: the whole rollout, by other names
+        memory = saved["processes"][0]["memory"]
+        saved["processes"][0]["memory"] = {"items": memory["hidden"], "episode_step": memory["episode_step"]}
+    elif missing == "return_scale":
+        del saved["processes"][0]["return_scale"]
+    elif missing == "optimizers":
+        (saved["optimizer"],) = saved.pop("optimizers")
+    else:
+        saved["optimizers"] = []
     torch.save(saved, path)
     before = sorted(folder.iterdir())
-    with pytest.raises(ValueError, match=r"is of an older version, .*; --load-model takes its weights"):
+    with pytest.raises(ValueError, match=r"is of another version, .*; --load-model takes its weights"):
         resumed(ppo_trxl, folder, "--total-timesteps", "256")
     assert sorted(folder.iterdir()) == before
 

@@ -295,7 +295,9 @@ def update_with(played, monkeypatch, target_kl):
     with monkeypatch.context() as patch:
         patch.setattr(ppo_gru, "ppo_loss", recorded)
         optimizer = torch.optim.SGD(run.agent.parameters(), lr=0.1)
-        return divergences, len(ppo_gru.update(run.agent, [optimizer], run.rollout, 0.0, args))
+        logs = ppo_gru.update(run.agent, [optimizer], run.rollout, 0.0, args)
+    assert [each["approx_kl"].item() for each in logs] == divergences, "the one that is too large is logged, too"
+    return divergences, sum("grad_norm" in each for each in logs)
 
 
 def test_target_kl_ends_the_update_at_the_first_minibatch_beyond_it(played, monkeypatch):

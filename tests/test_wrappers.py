@@ -163,9 +163,9 @@ def test_needs_same_step_autoreset(wrapper):
 
 @pytest.mark.parametrize("wrapper", [GrayscaleStack, SpotlightPerturbation])
 def test_needs_a_picture(wrapper):
-    with pytest.raises(ValueError, match=f"{wrapper.__name__} needs one .* picture"):
+    with pytest.raises(ValueError, match=f"{wrapper.__name__} needs one .* image"):
         wrapper(sync(lambda: gym.make("CartPole-v1")))
-    with pytest.raises(ValueError, match=f"{wrapper.__name__} needs one .* picture"):
+    with pytest.raises(ValueError, match=f"{wrapper.__name__} needs one .* image"):
         wrapper(GrayscaleStack(make("MysteryPath-v0")))
 
 
