@@ -78,7 +78,8 @@ class Shows(gym.Env):
     metadata = {"render_modes": []}  # noqa: RUF012
 
     def __init__(self, space, action_space=None, render_mode=None):
-        self.observation_space, self.action_space = space, action_space or gym.spaces.Discrete(2)
+        self.observation_space = space
+        self.action_space = gym.spaces.Discrete(2) if action_space is None else action_space
         self.render_mode = render_mode
 
     def look(self):
@@ -645,6 +646,7 @@ CASES = [
     ("nowhere:Env-v0", {}, "nowhere"),
     ("Pendulum-v1", {}, r"action space Box.* is not supported; use Discrete or one-dimensional MultiDiscrete"),
     (shows(NUMBER, action_space=gym.spaces.MultiDiscrete([[2, 2]])), {}, "action space .* is not supported"),
+    (shows(NUMBER, action_space=gym.spaces.MultiDiscrete([])), {}, "action space .* is not supported"),
     (shows(GRAPH), {}, "observation space observation: Graph.* is not supported; use images"),
     (shows(gym.spaces.Sequence(NUMBER)), {}, "observation space observation: Sequence.* is not supported"),
     (shows(gym.spaces.Dict({"a.b": NUMBER, "a": gym.spaces.Dict({"b": NUMBER})})), {}, "two parts have the same name"),
