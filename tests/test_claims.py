@@ -171,3 +171,18 @@ def test_the_page_ends_with_the_tables_of_the_results_that_are_there(capsys):
 def test_unknown_claim():
     with pytest.raises(SystemExit, match="there is no claim gru; there are memory-mortar-mayhem, "):
         claims.main(claims.Config(claims=("gru",)))
+
+
+@pytest.mark.parametrize(("seeds", "text"), [((1, 2), "not decided"), ((1, 2, 3), "not learned")])
+def test_what_is_learned_is_judged_by_all_runs_without_memory(monkeypatch, capsys, seeds, text):
+    """They score higher than both agents; of a part of them nothing is concluded."""
+
+    def result_of(config, plan):
+        mean = 1.0 + 0.1 * plan.seed + (plan.agent == "no memory")
+        curve = np.array([100]), np.full((1, 4, 1), mean)
+        there = plan.agent != "no memory" or plan.seed in seeds
+        return claims.evaluate.RunLog("", {}, {"eval/commands_completed": curve}) if there else None
+
+    monkeypatch.setattr(learning, "result_of", result_of)
+    claims.main(claims.Config(claims=("score-endless-mortar-mayhem",), report=True))
+    assert f"Of 1 rows: 1 {text}." in capsys.readouterr().out

@@ -114,6 +114,14 @@ def test_training_goes_on_as_if_there_had_been_none(tiny, curves, script):
         assert evaluated[name] == without[name], name
 
 
+def test_equal_weights_score_the_same_whenever_they_are_evaluated(tiny, curves):
+    """Actions are drawn with the run's seed, so that evaluations differ by what was learned alone."""
+    args = tiny(env_id="MortarMayhemB-Grid-v0", total_timesteps=192, init_lr=0.0, final_lr=0.0, eval_interval=1, **FEW)
+    (_, first), (_, second), (_, third) = curves(ppo_gru.main(args))["eval_levels/length"]
+    assert first == second == third
+    assert len({length for level in first for length in level}) > 1
+
+
 def test_an_episode_is_an_environment_s_first(played):
     """Those that follow while others play on count nowhere."""
     args, run, *_ = played(env_id="Numbered-v0", num_levels=0, start_level=0)

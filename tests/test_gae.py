@@ -36,7 +36,8 @@ def test_truncation_counts_as_an_end():
 
 def test_bootstrapped_truncation_values_the_final_observation_and_cuts_the_trace():
     # 2 + 0.5 * 20 - 6 = 6; nothing of the next episode's step 2 flows back.
-    assert advantages(truncated=[1], truncation_values=(0, 20, 0)) == pytest.approx([0.25 * 6, 6.0, 0.0])
+    found = advantages(truncated=[1], truncation_values=(0, 20, 0), rewards=(1.0, 2.0, 103.0))
+    assert found == pytest.approx([0.25 * 6, 6.0, 100.0])
 
 
 def test_end_at_the_last_step_ignores_the_value_of_what_follows():

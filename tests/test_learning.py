@@ -23,6 +23,7 @@ import claims
 import evaluate
 import learning
 import ppo_gru
+import tables
 from ppo_utils.runs import run_to_end
 from suites import short
 
@@ -234,12 +235,15 @@ def test_weights_of_an_earlier_step_are_not_scored(tmp_path, monkeypatch):
     """A run was stopped, which wrote them, went on, and was killed before it wrote its last ones."""
     agent = {"steps": [64], "metrics": {"return": {"scores": [[[1.0]]]}}}
     (tmp_path / "test_scores.json").write_text(json.dumps([{"agents": [agent]}]))
-    monkeypatch.setattr(subprocess, "run", lambda *args, **how: subprocess.CompletedProcess(args, 0))
+    lines = []
+    done = subprocess.CompletedProcess((), 0)
+    monkeypatch.setattr(subprocess, "run", lambda line, **how: (lines.append(" ".join(line)), done)[1])
     config = learning.Config(folder=tmp_path)
-    plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", 1)
+    plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU --eval-max-steps 123", 1)
     run = evaluate.RunLog(str(tmp_path), {}, {name: (np.array([96]), np.ones(1)) for name in evaluate.SECONDS.values()})
     with pytest.raises(SystemExit, match="has weights of step 64, not 96"):
         learning.test_scores(config, plan, run)
+    assert "--max-steps 123" in lines[0], "as its evaluations have"
 
 
 @pytest.mark.parametrize(("last", "tested"), [(None, True), (64, True), ("end", False)])
@@ -258,6 +262,7 @@ def test_a_run_without_a_score_at_its_end_is_no_result(last, tested, tmp_path, m
     monkeypatch.setattr(learning, "runs_in", lambda place, plan: [run])
     test = {"test/commands_completed": ([end], np.ones((1, 5, 1)))} if tested else {}
     monkeypatch.setattr(learning, "test_scores", lambda *_: test)
+    monkeypatch.setattr(learning, "train", lambda *_: pytest.fail("it has been trained"))
     with pytest.raises(SystemExit, match=r"GRU on .*, has no commands_completed at its end: an evaluation was cut"):
         learning.write_result(config, plan)
     assert not (tmp_path / "results").exists()
@@ -344,6 +349,8 @@ def test_an_agent_named_as_in_the_suite_is_the_suite_s():
     config = learning.Config(suite="full", tasks=("MysteryPath-v0",), agents=("TrXL", "TrXL, refreshed"), seeds=(1,))
     wide, narrow = learning.plans_of(config).values()
     assert (wide.args.trxl_dim, narrow.args.trxl_dim) == (96, 64)
+    (preset,) = learning.plans_of(replace(config, agents=("TrXL, preset",))).values()
+    assert (preset.args.trxl_dim, preset.args.trxl_memory_gradient) == (96, True)
 
 
 def test_the_full_suite():
@@ -362,3 +369,27 @@ def test_the_laptop_suite_has_budgets_of_its_own():
         (plan,) = learning.plans_of(config).values()
         of_suites[suite] = plan.args.total_timesteps
     assert of_suites == {"laptop": 3_000_000, "full": 6_000_000}
+
+
+def test_a_run_goes_on_only_from_a_checkpoint(tmp_path, monkeypatch):
+    """One that was stopped before its first begins again."""
+    config, script = learning.Config(folder=tmp_path), tmp_path / "script.py"
+    script.write_text("import sys; print(sys.argv[1:])")
+    plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", 1)
+    plan = replace(plan, command=(sys.executable, str(script), "--seed", "1"))
+    run = tmp_path / "runs/a"
+    run.mkdir(parents=True)
+    monkeypatch.setattr(learning, "runs_in", lambda place, plan: [evaluate.RunLog(str(run), {}, {})])
+    learning.train(config, plan)
+    (run / "checkpoint-64.pt").touch()
+    learning.train(config, plan)
+    (log,) = tmp_path.glob("*.log")
+    assert log.read_text() == "['--seed', '1']\n['--resume', 'runs/a']\n"
+
+
+def test_only_the_agents_to_draw_are_drawn(tmp_path, monkeypatch):
+    drawn, task = {}, "MortarMayhem-Grid-v0"
+    monkeypatch.setattr(tables, "draw", lambda tasks, out: drawn.update(tasks))
+    config = learning.Config(suite="laptop", tasks=(task,), draw=("GRU, Muon",), report=True)
+    learning.main(replace(config, results=ROOT / "benchmarks/results"))
+    assert [*drawn[task]] == ["GRU, Muon"]

@@ -84,6 +84,7 @@ def test_the_optimizer(tiny, opened, script):
     assert isinstance(optimizer, torch.optim.AdamW)
     assert {*group["params"]} == {*run.agent.parameters()}
     assert (group["weight_decay"], float(group["lr"]), group["betas"]) == (0.01, 0.125, (0.9, 0.999))
+    assert group["eps"] == 1e-8
 
 
 @pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
@@ -105,6 +106,8 @@ def test_muon_has_the_matrices_between_hidden_layers(tiny, opened, script):
     ]
     assert {names[weight] for weight in group["params"]} == common | {f"{b}{i}.weight" for b in blocks for i in inside}
     assert (group["weight_decay"], group["momentum"], group["adjust_lr_fn"]) == (0.01, 0.95, "match_rms_adamw")
+    assert (group["nesterov"], group["ns_steps"]) == (True, 5)
+    assert (theirs["weight_decay"], theirs["betas"], theirs["eps"]) == (0.01, (0.9, 0.999), 1e-8)
 
 
 def test_muon_s_learning_rate(tiny, monkeypatch):

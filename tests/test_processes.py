@@ -150,6 +150,18 @@ def test_a_maximum_is_the_maximum_of_all_processes():
     assert episodes == {"a": [1.0, 2.0], "b": [3.0]}
 
 
+@pytest.mark.parametrize(("others", "steps"), [(0.0, 4), (1.0, 1)])
+def test_target_kl_is_compared_with_the_mean_of_all_processes(tiny, opened, monkeypatch, others, steps):
+    """Here two; what this one has is far below the target."""
+    args = tiny(**GRID, target_kl=0.4, init_lr=1e-6, total_timesteps=64)
+    run = opened(ppo_gru, args)
+    ppo_gru.collect(run.agent, run.envs, run.rollout, args)
+    run.rollout.advantages, run.rollout.returns = torch.zeros(2, *run.rollout.values.shape)
+    monkeypatch.setattr(ppo_gru, "all_gather", lambda kl: [kl, others])
+    logs = ppo_gru.update(run.agent, run.optimizers, run.rollout, 0.0, args)
+    assert sum("grad_norm" in each for each in logs) == steps
+
+
 def test_a_resumed_run_is_the_unstopped_one(curves):
     script = ppo_trxl
     extra = {"eval-interval": 2, "eval-levels": 2, "target-kl": 5e-6, "checkpoint-interval": 3}

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import SCRIPTS, parse_args
+from tensorboard.summary.writer.record_writer import RecordWriter
 
 import enjoy
 import evaluate
@@ -207,7 +208,7 @@ def test_a_checkpoint_is_a_model_too(tiny, opened, script):
 
 
 def test_environments_of_other_packages_begin_new_episodes(tiny, opened, curves, monkeypatch, capfd):
-    args = tiny(env_id="CartPole-v1", total_timesteps=5 * 64)
+    args = tiny(env_id="CartPole-v1", total_timesteps=5 * 64, norm_reward=True)
     folder = interrupted(monkeypatch, ppo_gru, args, 2)
     capfd.readouterr()
     run = opened(ppo_gru, parse_args(ppo_gru, "--resume", str(folder)))
@@ -216,6 +217,8 @@ def test_environments_of_other_packages_begin_new_episodes(tiny, opened, curves,
     for name, part in run.rollout.next_obs.items():
         assert not (part == first.rollout.next_obs[name]).all(axis=1).any(), "not the episodes that it began with"
     assert not run.rollout.memory_state.hidden.any()
+    scale = run.rollout.return_scale
+    assert (scale.count, scale.discounted.any()) == (128, False), "no reward of an earlier episode counts"
     runs.run_to_end(args, run, ppo_gru.train)
     assert [step for step, _ in curves(folder)["losses/loss"]] == [64, 128, 192, 256, 320]
 
@@ -238,22 +241,24 @@ def test_what_else_a_run_goes_on_with(tiny, opened):
     assert run.returns
 
 
-def test_curves_are_there_before_their_checkpoint(tiny, curves, monkeypatch):
+def test_curves_are_there_before_their_checkpoint(tiny, scalars, monkeypatch):
     """A kill right after a checkpoint leaves no gap: the run goes on after what was logged."""
-    seen, write = [], checkpoints.write_file
+    seen, write, record = [], checkpoints.write_file, RecordWriter.write
+    slow = lambda writer, data: (time.sleep(0.02), record(writer, data))  # noqa: E731 (as a disk that is busy)
+    monkeypatch.setattr(RecordWriter, "write", slow)
 
     def write_file(saved, path):
-        seen.append((saved["step"], curves(path.parent)["losses/loss"][-1][0]))
+        seen.append((saved["step"], len(scalars(path.parent).get("charts/SPS", ()))))  # the last that is logged
         write(saved, path)
 
     monkeypatch.setattr(checkpoints, "write_file", write_file)
     ppo_gru.main(tiny(**GRID, checkpoint_interval=1))
-    assert seen == [(64, 64), (128, 128)]
+    assert seen == [(64, 1), (128, 2)]
 
 
 def test_files_of_a_process_that_was_killed_while_it_wrote(trained):
     """They go when the run goes on, and are no checkpoint."""
-    leftover = trained / "checkpoint-192.pt.part"
+    leftover = trained / "checkpoint-150.pt.part"  # of a step whose file is not written again
     leftover.write_bytes(b"half of a file")
     assert resumed(ppo_gru, trained, "--total-timesteps", "192") == trained
     assert not leftover.exists()

@@ -47,3 +47,18 @@ def test_the_scale_of_rewards_changes_nothing(tiny, curves, script):
     assert [8 * value for _, value in small["charts/episodic_return"]] == pytest.approx(
         [value for _, value in large["charts/episodic_return"]]
     )
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_after_one_rollout_the_returns_of_the_divided_rewards_have_deviation_one(tiny, opened, script):
+    """With the training's --gamma, and episodes that a time limit ends."""
+    changes = {"env_id": "MysteryPath-Grid-v0", "env_options": '{"max_steps": 5, "reward_step": -1.0}', "gamma": 0.5}
+    args = tiny(script, obs_type="vector", norm_reward=True, total_timesteps=64, **changes)
+    run = opened(script, args)
+    script.train(args, run)
+    assert run.rollout.truncated.any()
+    returns, now = [], torch.zeros(4)
+    for rewards, done in zip(run.rollout.rewards, run.rollout.done, strict=True):
+        returns.append(now * 0.5 + rewards)
+        now = returns[-1] * ~done
+    assert torch.stack(returns).std(correction=0).item() == pytest.approx(1.0, rel=1e-5)

@@ -271,6 +271,13 @@ def test_deterministic_algorithms_are_asked_for(tiny, opened, monkeypatch, asked
     assert torch.backends.cudnn.deterministic == asked
 
 
+def test_seconds_of_an_iteration_are_those_of_its_parts(tiny, scalars):
+    found = scalars(ppo_gru.main(tiny(env_id="CueRecall-v0")))
+    parts = np.add(found["charts/seconds_collect"], found["charts/seconds_update"])
+    assert parts == pytest.approx(found["charts/seconds_iteration"], rel=1e-4)
+    assert found["charts/SPS"] == pytest.approx(np.array([64, 128]) / np.cumsum(parts), rel=1e-4), "since it began"
+
+
 def test_annealing(tiny, scalars):
     rates = {"init_lr": 1e-3, "final_lr": 1e-4, "init_ent_coef": 0.1, "final_ent_coef": 0.01}
     down = scalars(ppo_gru.main(tiny(env_id="CueRecall-v0", total_timesteps=256, anneal_steps=128, **rates)))
@@ -359,6 +366,7 @@ def test_presets(script):
         args = parse_args(script, "--preset", name)
         assert args == script.Args(**held)
         assert args.preset == name
+        assert args.anneal_steps == args.total_timesteps
         check_args(args)
     held = script.PRESETS["laptop"]
     given = parse_args(script, "--num-steps", "7", "--preset=laptop", "--env-id", "CartPole-v1")

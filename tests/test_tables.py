@@ -217,25 +217,56 @@ def test_the_table_of_minutes_is_printed_by_its_command(capsys):
     assert capsys.readouterr().out in (ROOT / "docs/tuning.md").read_text()
 
 
-def test_speeds_are_measured(tmp_path, monkeypatch):
-    """Of all agents of a task, in turn; other tasks keep theirs. Here with trainings of an iteration."""
-    speeds = tmp_path / "speeds.csv"
+def test_the_axis_of_a_single_seed(tmp_path, monkeypatch):
+    """It has no standard error: the axis ends at its highest mean."""
+    drawn = []
+    monkeypatch.setattr(tables.Figure, "savefig", lambda figure, *args, **flags: drawn.append(figure))
+    tasks, _ = two_tasks(gru=((0.6,), (7,)), none=((0.2,), (1,)))
+    tables.draw(tasks, tmp_path / "curves.png")
+    assert [axis.get_ylim() for axis in drawn[0].axes] == [(0, 1), (0, 7)]
+
+
+HEAD = "task,script,preset,steps_per_second\n"
+
+
+def test_a_speed_is_that_of_the_whole_training_on_one_core(tmp_path, monkeypatch):
+    """Other tasks keep theirs, and all stay until all are measured."""
     kept = [f"SearingSpotlights-v0,{','.join(key)},7" for key in tuning.AGENTS]
     old = [f"MortarMayhem-Grid-v0,{','.join(key)},0" for key in reversed(tuning.AGENTS)]
-    speeds.write_text("\n".join(["task,script,preset,steps_per_second", *kept, *old]))
-    monkeypatch.setattr(tuning, "SPEEDS", speeds)
-    monkeypatch.setattr(tuning, "STEPS", 256)
-    small = " --num-envs 4 --num-steps 32 --num-minibatches 2"
-    monkeypatch.setattr(
-        tuning, "AGENTS", {key: (suite, agent + small) for key, (suite, agent) in tuning.AGENTS.items()}
-    )
-    tuning.measure_speeds(("MortarMayhem-Grid-v0",))
-    head, *rows = speeds.read_text().splitlines()
-    assert head == "task,script,preset,steps_per_second"
-    assert {row.rpartition(",")[0] for row in rows[:4]} == {
-        f"MortarMayhem-Grid-v0,{','.join(key)}" for key in tuning.AGENTS
-    }
-    assert all(int(row.rpartition(",")[2]) > 0 for row in rows[:4])
+    before = HEAD + "\n".join([*kept, *old])
+    monkeypatch.setattr(tuning, "SPEEDS", tmp_path / "speeds.csv")
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    tuning.SPEEDS.write_text(before)
+
+    def run(command, check, cwd, env):
+        assert (env["OMP_NUM_THREADS"], tuning.SPEEDS.read_text()) == ("1", before)
+        Path(cwd, "runs", "it").mkdir(parents=True)
+
+    speeds = {"charts/SPS": (np.array([128, 256]), np.reshape([10.0, 20.4], (2, 1, 1)))}
+    monkeypatch.setattr(tuning.subprocess, "run", run)
+    monkeypatch.setattr(evaluate, "read_run", lambda path: evaluate.RunLog(path, {}, speeds))
+    asked, measure = [], tuning.measure_speeds
+    monkeypatch.setattr(tuning, "measure_speeds", lambda tasks: (asked.append(tasks), measure(tasks)))
+    monkeypatch.setattr(tuning, "table", lambda speeds: "")
+    tuning.main(tuning.Config())
+    assert asked == []
+    tuning.main(tuning.Config(measure=("MortarMayhem-Grid-v0",)))
+    head, *rows = tuning.SPEEDS.read_text().splitlines()
+    assert f"{head}\n" == HEAD
+    assert sorted(rows[:4]) == sorted(f"MortarMayhem-Grid-v0,{','.join(key)},20" for key in tuning.AGENTS)
     assert rows[4:] == kept
     with pytest.raises(SystemExit, match="there is no 'mortar-mayhem'; there are MortarMayhem"):
-        tuning.measure_speeds(("mortar-mayhem",))
+        measure(("mortar-mayhem",))
+
+
+def test_a_speed_is_measured(tmp_path, monkeypatch):
+    """Here of a training of an iteration."""
+    monkeypatch.setattr(tuning, "SPEEDS", tmp_path / "speeds.csv")
+    monkeypatch.setattr(tuning, "STEPS", 256)
+    tuning.SPEEDS.write_text(HEAD)
+    agent = "TrXL, Muon --num-envs 4 --num-steps 32 --num-minibatches 2"
+    monkeypatch.setattr(tuning, "AGENTS", {("ppo_trxl.py", "Muon"): ("laptop", agent)})
+    tuning.measure_speeds(("MortarMayhem-Grid-v0",))
+    ((key, speed),) = tuning.read_speeds().items()
+    assert key == ("MortarMayhem-Grid-v0", "ppo_trxl.py", "Muon")
+    assert speed > 0

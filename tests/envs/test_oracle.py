@@ -181,14 +181,15 @@ def grid_arrival(headings: list[int]) -> int:
 @pytest.mark.parametrize("seed", range(8))
 def test_player_walks_the_path(env_id, seed):
     env = gym.make(env_id).unwrapped
-    options = {"reward_path_progress": 0.1, "reward_fall_off": -5.0}
+    goal = 1.0 if seed % 2 else -2.0
+    options = {"reward_path_progress": 0.1, "reward_fall_off": -5.0} | ({} if seed % 2 else {"reward_goal": goal})
     rewards, terminated, truncated, info = play_out(env, lambda: player(env.batch)[0], seed, options)
     s = env.batch.state
     headings = s.direction_at[0, 1 : s.path_length[0]].tolist()
     assert (terminated, truncated) == (True, False)
     assert len(rewards) == info["length"] == (grid_arrival if "Grid" in env_id else arrival)(headings)
-    assert [r for r in rewards if r] == [0.1] * (len(headings) - 1) + [1.0]
-    assert info["reward"] == pytest.approx(1.0 + 0.1 * (len(headings) - 1))
+    assert [r for r in rewards if r] == [0.1] * (len(headings) - 1) + [goal]
+    assert info["reward"] == pytest.approx(goal + 0.1 * (len(headings) - 1))
     assert (info["success"], info["num_fails"]) == (1, 0)
 
 

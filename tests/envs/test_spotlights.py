@@ -44,10 +44,12 @@ def still():
 @pytest.mark.parametrize("seed", range(4))
 def test_player_collects_every_coin_and_leaves(coins, seed):
     env, act = make(FINITE)
-    rewards, terminated, truncated, info = play_out(env, act, seed, {**SAFE, "num_coins": [coins]})
+    pays = {"reward_coin": 0.5, "reward_exit": -3.0} if seed % 2 else {}
+    rewards, terminated, truncated, info = play_out(env, act, seed, {**SAFE, "num_coins": [coins], **pays})
+    coin, leaving = pays.values() or (0.25, 1.0)
     assert (terminated, truncated) == (True, False)
-    assert [r for r in rewards if r] == [0.25] * coins + [1.0]
-    assert info["reward"] == 0.25 * coins + 1.0
+    assert [r for r in rewards if r] == [coin] * coins + [leaving]
+    assert info["reward"] == coin * coins + leaving
     assert info["length"] == len(rewards)
     assert (info["success"], info["coins_collected"], info["agent_health"]) == (1, 1.0, 1.0)
 
