@@ -106,7 +106,7 @@ class Lane(gym.Wrapper):
             print(f"environment {self._number} raised {error!r} when it was closed", file=sys.stderr)
 
     @property
-    def _place(self) -> "Place":
+    def _place(self) -> Place:
         return Place(self._number, self._seed, self._steps)
 
     @contextlib.contextmanager
@@ -115,7 +115,7 @@ class Lane(gym.Wrapper):
         try:
             yield
         except UnfitError as error:
-            raise RunError(f"{self.spec.id}: {error} ({self._place})") from None
+            raise RunError(f"{self.unwrapped.spec.id}: {error} ({self._place})") from None
         except Exception as error:
             what = f"environment {self._number} raised {type(error).__name__} in {where}{self._place.step}"
             raise RuntimeError(": ".join(filter(None, [what, one_line(error)]))) from error
