@@ -28,6 +28,7 @@ AGENTS = {
     **MEMORIES,
     "TrXL, preset": ADAMW_TRXL,
     "no memory, Muon": "ppo_gru.py --memory none",  # today's --preset laptop
+    "stack of 16, Muon": "ppo_gru.py --memory none --frame-stack 16",
     "GRU, Muon": "ppo_gru.py",
     "TrXL, Muon": "ppo_trxl.py",
     **{f"{name}, entropy": f"{flags} {ENTROPY}" for name, flags in MEMORIES.items()},
@@ -140,6 +141,7 @@ LAPTOP = {
     env_id: replace(FULL[env_id], total_timesteps=int(1_000_000 * millions))
     for env_id, millions in {
         "MortarMayhem-Grid-v0": 6,
+        "MortarMayhemB-Grid-v0": 6,
         "Endless-MortarMayhem-v0": 3,
         "Endless-MysteryPath-v0": 3,
         "SearingSpotlights-v0": 3,
@@ -161,7 +163,7 @@ SUITES = {  # tasks and agents
             *(f"{name} {WIDE}" for name in ("TrXL", "GTrXL", "TrXL, preset")),
         ),
     ),
-    "laptop": (LAPTOP, ("no memory, Muon", "GRU, Muon", "TrXL, Muon")),
+    "laptop": (LAPTOP, ("no memory, Muon", "stack of 16, Muon", "GRU, Muon", "TrXL, Muon")),
 }
 COLORS = {  # an agent has the same in every picture
     "no memory": "tab:gray",
@@ -174,6 +176,7 @@ COLORS = {  # an agent has the same in every picture
     "GTrXL": "tab:purple",
     "TrXL+": "tab:red",
     "no memory, Muon": "tab:gray",
+    "stack of 16, Muon": "tab:brown",
     "GRU, Muon": "tab:blue",
     "TrXL+, Muon": "tab:red",
 }
