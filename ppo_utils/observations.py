@@ -171,6 +171,8 @@ class Part:
         if self.axes is not None:
             values = self._as_image(np.asarray(values))
             if self._is_bytes:
+                if values.dtype != np.uint8:  # larger numbers would wrap around
+                    within(values, 0, 255)
                 return np.require(values, np.uint8, WRITABLE)
             low, high = self.bounds
             within(finite(values), low, high)

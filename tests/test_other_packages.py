@@ -19,6 +19,7 @@ from test_environments import box, register, roll
 import ppo_gru
 from ppo_utils import environments, evaluation, runs
 from ppo_utils.environments import env_actions, envs_for, final_numbers, find_spec, ground_truth_of, make_envs
+from ppo_utils.observations import Part, WrongValue
 from ppo_utils.processes import RunError
 from ppo_utils.video import LaneVideo, as_image, even, video_writer
 
@@ -580,6 +581,17 @@ def test_a_small_type_holds_its_values():
     space = gym.spaces.MultiDiscrete([200, 3], dtype=np.uint8, start=[56, 0])
     envs = make_envs(small(space=space, see=lambda env: np.array([255, 2], np.uint8)), 1, seed=1)
     assert np.flatnonzero(envs.reset()[0]["observation"]).tolist() == [199, 202]
+
+
+def test_bytes_do_not_wrap_around():
+    """Of a vector environment of another package, whatever type of numbers it returns."""
+    part = Part.of(("observation",), PICTURE)
+    right = np.full((2, *PICTURE.shape), 200)
+    assert part.convert({"observation": right}).tolist() == right.tolist()
+    right[1, 0, 0, 0] = 300
+    with pytest.raises(WrongValue, match="outside of 0 to 255") as error:
+        part.convert({"observation": right})
+    assert error.value.args == (1, "is 300, outside of 0 to 255")
 
 
 SHAPES = [
