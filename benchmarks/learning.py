@@ -38,6 +38,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 import tyro
 from tqdm import tqdm
 
@@ -324,11 +325,12 @@ def test_scores(config: Training, plan: Plan, run: evaluate.RunLog) -> dict[str,
 
 
 def machine() -> str:
-    """Name this machine's processor and number of cores, and the version of PyTorch."""
+    """Name this machine's processor, its number of cores, its GPU if there is one, and the version of PyTorch."""
     cpuinfo = Path("/proc/cpuinfo")  # of Linux; elsewhere, Python knows the name
     models = re.findall(r"^model name\s*: (.*)", cpuinfo.read_text() if cpuinfo.exists() else "", re.MULTILINE)
     processor = models[0] if models else platform.processor() or platform.machine()
-    return f"{processor}, {os.cpu_count()} cores, PyTorch {version('torch')}"
+    gpu = f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
+    return f"{processor}, {os.cpu_count()} cores{gpu}, PyTorch {version('torch')}"
 
 
 def train_missing(config: Training, wanted: list[Plan]) -> None:

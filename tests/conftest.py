@@ -125,7 +125,7 @@ def played(tiny, opened):
                 parameter.mul_(weights_scale)
         for _ in range(iterations):
             last_value, episodes = script.collect(run.agent, run.envs, run.rollout, args)
-        run.rollout.advantages, run.rollout.returns = torch.zeros(2, *run.rollout.values.shape)
+        run.rollout.advantages, run.rollout.returns = run.rollout.values.new_zeros(2, *run.rollout.values.shape)
         return args, run, last_value, episodes
 
     return play

@@ -46,7 +46,7 @@ def each_memory(memories):
 def recompute(run):
     """Evaluate the whole rollout in one batch of pieces; return the pieces' steps, ratios and values."""
     rollout = run.rollout
-    pieces = run.agent.memory.cut(rollout.done)
+    pieces = run.agent.memory.cut(rollout.done.cpu())
     index = pieces.flat_index()
     x = run.agent.encoder({name: part.flatten(0, 1)[index] for name, part in rollout.obs.items()})
     actions = rollout.actions.flatten(0, 1)[index]
