@@ -89,6 +89,10 @@ def check_args(args: Any) -> None:
     for name in ("reconstruction", "ground_truth"):
         if getattr(args, f"{name}_detach") and not getattr(args, f"{name}_coef"):
             raise ValueError(f"{flag(f'{name}_detach')} needs {flag(f'{name}_coef')} above 0")
+    if args.optimizer != "muon" and args.muon_lr_ratio != type(args).muon_lr_ratio:
+        raise ValueError(f"--muon-lr-ratio needs --optimizer muon; it is {args.optimizer}")
+    if args.refresh_memory and args.update_epochs == 1:
+        raise ValueError("--refresh-memory needs --update-epochs above 1: the first epoch has fresh memory")
     batch_size = args.num_envs * args.num_steps
     if args.total_timesteps < batch_size:
         raise ValueError(

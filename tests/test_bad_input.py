@@ -53,6 +53,9 @@ CASES = {
     "--vf-coef inf": "--vf-coef is inf; it must be 0 or more",
     "--muon-lr-ratio inf": "--muon-lr-ratio is inf; it must be above 0 and at most 1000",
     "--ground-truth-detach": "--ground-truth-detach needs --ground-truth-coef above 0",
+    "--optimizer adamw --muon-lr-ratio 5": "--muon-lr-ratio needs --optimizer muon; it is adamw",
+    "--refresh-memory --update-epochs 1": "--refresh-memory needs --update-epochs above 1: the first epoch has fresh "
+    "memory",
     "--memory none --seq-len 5": "--seq-len, --num-layers and --refresh-memory need --memory gru or lstm",
     "--memory none --refresh-memory": "--refresh-memory need --memory gru or lstm",
     "--env-id .foo:x-v0": "the module of .foo:x-v0 begins with a dot",
