@@ -49,8 +49,8 @@ class Config:
     """how often bound and script are timed in turn"""
     chunks: list[int] = field(default_factory=lambda: [64, 128, 256, 512])
     """sizes of piece that the bound may choose from"""
-    flags: list[str] = field(default_factory=list)
-    """further flags of the script, e.g. --flags=--memory --flags=lstm"""
+    flags: str = ""
+    """further flags of the script in one argument, e.g. --flags='--memory lstm'"""
 
 
 def seconds(work: Callable[[], None], device: torch.device) -> float:
@@ -87,8 +87,8 @@ def one_iteration(script: ModuleType, args: Any, run: Any) -> None:
 def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, int]:
     """Return the steps/s of the script and of both bounds, the share of distinct pictures, and the best piece."""
     script = importlib.import_module(config.script)
-    flags = ["--env-id", config.env_id, "--num-envs", str(config.num_envs), "--num-steps"]
-    args = parse_args(script.Args, script.PRESETS, [*flags, str(num_steps), *config.flags])
+    flags = f"--env-id {config.env_id} --num-envs {config.num_envs} --num-steps {num_steps} {config.flags}"
+    args = parse_args(script.Args, script.PRESETS, flags.split())
     args.total_timesteps = config.num_envs * num_steps  # of one call of train
     args.checkpoint_interval = 0
     short = replace(args, num_steps=32)
@@ -118,7 +118,7 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, in
 
 def main(config: Config) -> None:
     """Print a Markdown table, a row per rollout length."""
-    print(f"{config.script} on {config.env_id} {' '.join(config.flags)}, {torch.get_num_threads()} threads\n")
+    print(f"{config.script} on {config.env_id} {config.flags}, {torch.get_num_threads()} threads\n")
     print("| lanes x steps | steps/s | distinct | convolutions alone | share | encoder alone | share | best piece |")
     print("|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
