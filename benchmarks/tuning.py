@@ -82,7 +82,7 @@ def table(speeds: dict[tuple[str, str, str], float]) -> str:
     """Return a row for each task, script and preset: score, steps to 0.5 and 0.9 of the best, and minutes.
 
     The best is the best possible score, or where there is no bound the highest mean of these agents. Minutes are those
-    of all steps at the measured steps per second.
+    of all steps at the measured steps per second. Raises SystemExit where an agent has no results.
     """
     lines = ["| task | script | preset | steps | score | steps to 0.5 | steps to 0.9 | steps/s | minutes |"]
     lines.append("|---|---|---|---:|---:|---:|---:|---:|---:|")
@@ -91,6 +91,8 @@ def table(speeds: dict[tuple[str, str, str], float]) -> str:
             key: learning.results_of(learning.Config(results=RESULTS), plans_of(name, *agent))[name].popitem()[1]
             for key, agent in AGENTS.items()
         }
+        if lacking := [" with ".join(key) for key, runs in runs_of.items() if not runs]:
+            raise SystemExit(f"{RESULTS} has no results of {lacking[0]} in {name}; learning.py trains what is missing")
         task = TASKS[name]
         curves = {
             key: evaluate.align([run.curves[f"eval/{task.score}"] for run in runs]) for key, runs in runs_of.items()

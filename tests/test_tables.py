@@ -217,6 +217,13 @@ def test_the_table_of_minutes_is_printed_by_its_command(capsys):
     assert capsys.readouterr().out in (ROOT / "docs/tuning.md").read_text()
 
 
+def test_a_table_of_minutes_needs_results(tmp_path, monkeypatch):
+    monkeypatch.setattr(tuning, "RESULTS", tmp_path)
+    task, script, preset = next(iter(tuning.read_speeds()))
+    with pytest.raises(SystemExit, match=f"no results of {script} with {preset} in {task}; learning.py trains"):
+        tuning.main(tuning.Config())
+
+
 def test_the_axis_of_a_single_seed(tmp_path, monkeypatch):
     """It has no standard error: the axis ends at its highest mean."""
     drawn = []
