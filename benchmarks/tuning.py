@@ -78,14 +78,20 @@ def measure_speeds(tasks: tuple[str, ...]) -> None:
         csv.writer(file).writerows([("task", "script", "preset", "steps_per_second"), *rows])
 
 
+def steps_to(goal: float, steps: np.ndarray, scores: np.ndarray) -> str:
+    """Return in millions the first of P steps at which the mean of the scores (P, R, M, E) is there; or nothing."""
+    there = np.flatnonzero(scores.mean((1, 2, 3)) >= goal)
+    return f"{steps[there[0]] / 1e6:.2f} M" if there.size else ""
+
+
 def table(speeds: dict[tuple[str, str, str], float]) -> str:
-    """Return a row for each task, script and preset: score, steps to 0.5 and 0.9 of the best, and minutes.
+    """Return a row for each task and script: score, steps to 0.5 and 0.9 of the best, minutes, and what AdamW had.
 
     The best is the best possible score, or where there is no bound the highest mean of these agents. Minutes are those
     of all steps at the measured steps per second. Raises SystemExit where an agent has no results.
     """
-    lines = ["| task | script | preset | steps | score | steps to 0.5 | steps to 0.9 | steps/s | minutes |"]
-    lines.append("|---|---|---|---:|---:|---:|---:|---:|---:|")
+    lines = ["| task | script | steps | score | steps to 0.5 | to 0.9 | steps/s | minutes | AdamW: to 0.5 | steps/s |"]
+    lines.append("|---|---|---:|---:|---:|---:|---:|---:|---:|---:|")
     for name in dict.fromkeys(task for task, _, _ in speeds):
         runs_of = {
             key: learning.results_of(learning.Config(results=RESULTS), plans_of(name, *agent))[name].popitem()[1]
@@ -98,14 +104,14 @@ def table(speeds: dict[tuple[str, str, str], float]) -> str:
             key: evaluate.align([run.curves[f"eval/{task.score}"] for run in runs]) for key, runs in runs_of.items()
         }
         best = task.best_score or max(scores[-1].mean() for _, scores in curves.values())
-        for (script, preset), (steps, scores) in curves.items():  # (P,), (P, R, M, E)
-            total = int(runs_of[script, preset][0].args["total_timesteps"])
-            speed = speeds[name, script, preset]
-            cells = [name, f"`{script}`", preset, f"{total / 1e6:g} M", tables.mean_and_error(scores[-1])]
-            for share in (0.5, 0.9):
-                there = np.flatnonzero(scores.mean((1, 2, 3)) >= share * best)
-                cells.append(f"{steps[there[0]] / 1e6:.2f} M" if there.size else "")
-            lines.append(f"| {' | '.join(cells)} | {speed:,.0f} | {total / speed / 60:.1f} |")
+        for script in ("ppo_trxl.py", "ppo_gru.py"):
+            muon, adamw = curves[script, "Muon"], curves[script, "AdamW"]
+            fast, slow = speeds[name, script, "Muon"], speeds[name, script, "AdamW"]
+            total = int(runs_of[script, "Muon"][0].args["total_timesteps"])
+            cells = [name, f"`{script}`", f"{total / 1e6:g} M", tables.mean_and_error(muon[1][-1])]
+            cells += [steps_to(0.5 * best, *muon), steps_to(0.9 * best, *muon), f"{fast:,.0f}"]
+            cells += [f"{total / fast / 60:.1f}", steps_to(0.5 * best, *adamw), f"{slow:,.0f}"]
+            lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
