@@ -1,4 +1,4 @@
-"""What holds on a CPU holds on a GPU: these tests need one."""
+"""What holds on a CPU holds on a GPU: `pytest tests/gpu.py` on a machine that has one."""
 
 import copy
 import os
@@ -14,14 +14,13 @@ from test_memory import MEMORIES, each_memory, recompute
 import evaluate
 import ppo_gru
 
-if not torch.cuda.is_available():
-    pytest.skip("there is no GPU", allow_module_level=True)
 PIXELS = {"env_id": "MortarMayhemB-Grid-v0", "cuda": True}
 
 
 @pytest.fixture(autouse=True)
 def _all_digits(monkeypatch):
     """Compute in float32 where a training has TF32, which has three decimal digits."""
+    assert torch.cuda.is_available(), "these tests need a GPU"
     monkeypatch.setattr(torch, "set_float32_matmul_precision", lambda precision: None)
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
 
@@ -60,7 +59,7 @@ def test_the_gradient_is_that_of_a_cpu(played, memory):
     args, run, *_ = played(iterations=2, weights_scale=3.0, **changes)
     run.rollout.advantages.normal_()
     run.rollout.returns = run.rollout.advantages + run.rollout.values
-    script = sys.modules[run.agent.__class__.__module__]
+    script = memory.get("script", ppo_gru)
     ours = gradient(script, run.agent, run.rollout, args)
     agent = copy.deepcopy(run.agent).cpu()
     theirs = gradient(script, agent, moved(run.rollout, "cpu"), args)
