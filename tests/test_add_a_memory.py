@@ -9,7 +9,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/add_a_memory.md").read_text()
-MEMORY, FLAGS, NEW_FLAGS = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+(MEMORY,) = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+FLAGS = re.findall(r"`(\w+)`", PAGE.split("delete the old memory's flags:")[1].split(".")[0])
 
 
 def replace(text, old, new):
@@ -26,8 +27,10 @@ def follow(folder):
         shutil.copytree(ROOT / name, folder / name, ignore=ignored)
     script = (ROOT / "ppo_gru.py").read_text()
     memory = script[script.index("@dataclass\nclass MemoryState:") : script.index("\n\n# ---- 5 AGENT ----")]
-    for old, new in [(memory, MEMORY), (FLAGS, NEW_FLAGS)]:
-        script = replace(script, old, new)
+    script = replace(script, memory, MEMORY)
+    for flag in FLAGS:
+        (field,) = re.findall(rf'^    {flag}: .*\n    """.*"""\n', script, re.MULTILINE)
+        script = replace(script, field, "")
     (folder / "ppo_mingru.py").write_text(script)
 
 
