@@ -20,6 +20,15 @@ MEMORIES = {
 }
 # The thesis' exploration bonus, with the weights that suit it on these tasks; the preset has the log barrier.
 ENTROPY = "--exploration-bonus entropy --init-ent-coef 1e-3 --final-ent-coef 1e-4"
+MUON = {  # today's --preset laptop
+    "no memory, Muon": "ppo_gru.py --memory none",
+    "stack of 16, Muon": "ppo_gru.py --memory none --frame-stack 16",
+    "GRU, Muon": "ppo_gru.py",
+    "TrXL, Muon": "ppo_trxl.py",
+}
+# Muon with what the thesis has: smaller steps, a longer horizon, rewards as they are.
+LOW_RATE = "--init-lr 3e-4 --gamma 0.995 --clip-coef 0.1 --no-norm-reward"
+LOW_RATE += " --exploration-bonus entropy --init-ent-coef 1e-4 --final-ent-coef 1e-5"
 AGENTS = {
     "no memory": f"{GRU} --memory none",
     "stack of 4": f"{GRU} --memory none --frame-stack 4",
@@ -27,10 +36,8 @@ AGENTS = {
     "step encoding": f"{GRU} --memory none --step-encoding",
     **MEMORIES,
     "TrXL, preset": ADAMW_TRXL,
-    "no memory, Muon": "ppo_gru.py --memory none",  # today's --preset laptop
-    "stack of 16, Muon": "ppo_gru.py --memory none --frame-stack 16",
-    "GRU, Muon": "ppo_gru.py",
-    "TrXL, Muon": "ppo_trxl.py",
+    **MUON,
+    **{f"{name}, low rate": f"{flags} {LOW_RATE}" for name, flags in MUON.items()},
     **{f"{name}, entropy": f"{flags} {ENTROPY}" for name, flags in MEMORIES.items()},
     **{f"{name}, refreshed": f"{flags} --refresh-memory" for name, flags in MEMORIES.items()},
     **{f"{name}, gradient": f"{MEMORIES[name]} --trxl-memory-gradient" for name in ("TrXL", "GTrXL")},
@@ -176,11 +183,9 @@ COLORS = {  # an agent has the same in every picture
     "TrXL": "tab:orange",
     "GTrXL": "tab:purple",
     "TrXL+": "tab:red",
-    "no memory, Muon": "tab:gray",
-    "stack of 16, Muon": "tab:brown",
-    "GRU, Muon": "tab:blue",
-    "TrXL+, Muon": "tab:red",
 }
+for name in ("no memory", "stack of 16", "GRU", "TrXL+"):
+    COLORS |= {f"{name}, Muon": COLORS[name], f"{name}, Muon, low rate": COLORS[name]}
 
 
 def short(agent: str) -> str:

@@ -36,10 +36,11 @@ def test_every_agent_s_command_can_be_parsed(task, agent):
     args = learning.plan(learning.Config(steps_scale=6), learning.TASKS[task], agent, 2).args
     assert args.total_timesteps == args.anneal_steps == 6 * learning.TASKS[task].total_timesteps
     assert args.refresh_memory == ("refreshed" in agent)
-    of_a_preset = agent in ("TrXL, preset", "TrXL, Muon")  # the thesis' queries do not know their step
+    of_a_preset = agent.startswith(("TrXL, preset", "TrXL, Muon"))  # the thesis' queries do not know their step
     assert getattr(args, "trxl_query_position", False) == of_a_preset
     assert getattr(args, "trxl_memory_gradient", False) == ("gradient" in agent or of_a_preset)
     assert getattr(args, "trxl_gate", None) == {"TrXL": "none", "GTrXL": "gru"}.get(agent.split(",")[0])
+    assert (args.init_lr == 3e-4) == (args.gamma == 0.995) == (args.clip_coef == 0.1) == ("low rate" in agent)
 
 
 def test_an_agent_may_have_further_flags(tmp_path):
