@@ -288,7 +288,7 @@ def draw_task(axis: Axes, task: Task, agents: evaluate.Runs, colors: dict[str, A
     places = spread([y / top for _, y in ends.values()], NAMES_APART)
     for (agent, (x, _)), place in zip(ends.items(), places, strict=True):
         where = {"xy": (x, place * top), "xytext": (4, 0), "textcoords": "offset points", "annotation_clip": False}
-        axis.annotate(textwrap.fill(agent, 20), **where, color=colors[agent], fontsize="small", va="center")
+        axis.annotate(textwrap.fill(agent, 28), **where, color=colors[agent], fontsize="small", va="center")
 
 
 def spread(places: list[float], apart: float) -> list[float]:
