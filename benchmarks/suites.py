@@ -184,8 +184,11 @@ COLORS = {  # an agent has the same in every picture
     "GTrXL": "tab:purple",
     "TrXL+": "tab:red",
 }
-for name in ("no memory", "stack of 16", "GRU", "TrXL+"):
-    COLORS |= {f"{name}, Muon": COLORS[name], f"{name}, Muon, low rate": COLORS[name]}
+COLORS |= {
+    f"{name}, Muon{rate}": COLORS[name]
+    for name in ("no memory", "stack of 16", "GRU", "TrXL+")
+    for rate in ("", ", low rate")
+}
 
 
 def short(agent: str) -> str:

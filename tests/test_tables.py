@@ -13,7 +13,7 @@ import evaluate
 import learning
 import tables
 import tuning
-from suites import COLORS, SUITES, TASKS, short
+from suites import AGENTS, COLORS, SUITES, TASKS, short
 
 ROOT = Path(__file__).parents[1]
 
@@ -172,9 +172,9 @@ def test_a_picture(tmp_path, monkeypatch):
     assert gru.get_ydata() == pytest.approx([0, 0, 0.7])
 
 
-def test_agents_of_the_suites_have_colors():
+def test_agents_that_are_drawn_have_colors():
     names = {short(agent) for _, agents in SUITES.values() for agent in agents}
-    assert names <= set(COLORS)
+    assert names | {short(agent) for agent in AGENTS if "low rate" in agent} == set(COLORS)
 
 
 def test_bounds_are_those_of_the_ten_tasks():
