@@ -16,16 +16,15 @@ from memory_gym_envs.variant import Variant
 
 HEAD = """# Vector observations
 
-`gym.make(id, obs_type="vector")`, and `gym.make_vec` likewise, return a flat float32 vector in place of the image, and
-draw none. It holds what the image shows and nothing that it hides: under the same options, two states with the same
-image have the same vector. What is not in sight is 0.
+With `obs_type="vector"`, observations are flat float32 vectors of what the image shows, and no image is drawn. Under
+the same options, two states with the same image have the same vector. What is not in sight is 0.
 
 A column with ids says where the entries are in their vector, counted from 0; its length is in brackets. Entries are
 from 0 to 1, unless a range stands beside them. Pixels count from the left and from the top of the 84 x 84 screen, x
 before y. The order of facings is up, up-left, left, and so on to up-right.
 
-- Where something hides a part of the agent, several facings or places may look the same. All these facings are then 1,
-  and the place is the middle of these places.
+- Where something hides a part of the agent, all facings that look the same are 1, and the place is the middle of those
+  that do.
 - Agents so large that they hide whole tiles hide their entries, too.
 - `size` and `arena`, where visible, change with options only.
 - In Searing Spotlights, what is seen below the bar is counted from every third pixel: a few visible pixels may count as
