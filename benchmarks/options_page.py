@@ -18,11 +18,10 @@ from memory_gym_envs.variant import Variant
 HEAD = f"""# Reset options
 
 `reset(options={{...}})` and `gym.make(id, options={{...}})` take these options.
-[How long they hold](environments.md#options). Columns with an id are its defaults: a dash where the id does not have
-the option, "ignored" where it takes the option without an effect, as the original does.
+[How long they hold](environments.md#options). Columns with an id are its defaults: a dash where it does not have the
+option, "ignored" where the option has no effect, as in the original.
 
 Allowed values include both ends. `ints` is a list of 1 to {LONGEST_LIST} integers; one is sampled at every reset.
-Made by `python benchmarks/options_page.py`.
 """
 
 

@@ -23,14 +23,11 @@ A column with ids says where the entries are in their vector, counted from 0; it
 from 0 to 1, unless a range stands beside them. Pixels count from the left and from the top of the 84 x 84 screen, x
 before y. The order of facings is up, up-left, left, and so on to up-right.
 
-- Where something hides a part of the agent, all facings that look the same are 1, and the place is the middle of those
-  that do.
+- Where something hides a part of the agent, all facings that would look the same are 1, and the place is the middle of
+  all places that would.
 - Agents so large that they hide whole tiles hide their entries, too.
-- `size` and `arena`, where visible, change with options only.
 - In Searing Spotlights, what is seen below the bar is counted from every third pixel: a few visible pixels may count as
   none.
-
-Made by `python benchmarks/vectors_page.py`.
 """
 
 
