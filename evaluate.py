@@ -70,7 +70,7 @@ OWN_METRIC = {
 }
 # Arguments that say how a run was started and recorded, not what learned.
 BOOKKEEPING = {"preset", "seed", "torch_deterministic", "cuda", "track", "capture_video", "save_model", "resume"}
-BOOKKEEPING |= {"checkpoint_interval", "eval_interval", "eval_levels", "eval_max_steps"}
+BOOKKEEPING |= {"checkpoint_interval", "eval_interval", "eval_levels", "eval_max_steps", "async_envs"}
 RESAMPLES = 2000
 LABEL_WIDTH = 48  # characters of a line in a legend; a longer one would leave no room for the curves
 POINTS = 200  # of a curve; one that has more is averaged over neighbours
@@ -216,8 +216,9 @@ def table(agents: list[dict[str, Any]]) -> str:
 
 # ---- AGENTS ----
 def task_of(args: dict[str, Any]) -> str:
-    """Name what was learned: runs of another environment, or with other reset parameters, do not compare."""
-    return args["env_id"] if args["env_options"] == "{}" else f"{args['env_id']} {args['env_options']}"
+    """Name what was learned: runs of another environment, or one made or reset with other arguments, do not compare."""
+    given = [args[name] for name in ("env_options", "env_kwargs") if args.get(name, "{}") != "{}"]
+    return " ".join([args["env_id"], *given])
 
 
 def own_metric(env_id: str) -> str:
@@ -230,7 +231,8 @@ def tasks_of(runs: dict[str, dict[str, Any]], title: Callable) -> dict[str, dict
     """Sort runs, arguments by path, into tasks and agents: the paths of an agent's seeds by title and label."""
     tasks = defaultdict(dict)
     for path, args in runs.items():
-        args = args | {"env_options": json.dumps(json.loads(args["env_options"]), sort_keys=True)}  # one spelling
+        for name in {"env_options", "env_kwargs"} & args.keys():  # one spelling
+            args = args | {name: json.dumps(json.loads(args[name]), sort_keys=True)}
         tasks[title(args)][path] = args
     return {name: agents_of(members) for name, members in tasks.items()}
 
@@ -687,7 +689,8 @@ def title_of(args: dict[str, Any], config: Config) -> str:
     """Name the task and the levels of it that are played."""
     after = args["start_level"] + args["num_levels"]
     first = after if config.start_level is None else config.start_level
-    trained_on = " (of its training)" if first < after and first + config.levels > args["start_level"] else ""
+    met = args["num_levels"] and first < after and first + config.levels > args["start_level"]
+    trained_on = " (of its training)" if met else ""
     levels = f"levels {first} to {first + config.levels - 1}{trained_on}, {config.repeats} times each"
     return f"{task_of(args)}, {levels}{', most probable actions' if config.deterministic else ''}"
 
@@ -758,6 +761,8 @@ def main(config: Config) -> None:
     for path in (config.json, config.out):
         if path is not None and not os.path.isdir(os.path.dirname(path) or "."):
             raise ValueError(f"there is no folder {os.path.dirname(path)} to write to")
+    if not os.path.basename(config.out):
+        raise ValueError(f"--out {config.out} is a folder; give the files' name too, as {config.out}curves")
     if config.json is not None and os.path.isdir(config.json):
         raise ValueError(f"--json {config.json} is a folder; give a file to write to")
     report = draw_curves(config) if config.curves else score_checkpoints(config)

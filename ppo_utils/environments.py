@@ -377,13 +377,13 @@ def ground_truth_of(infos: dict[str, Any], args: Any, before: np.ndarray | None 
         return None
     if OWN in infos:
         truths = [info.get("ground_truth") for info, _ in infos[OWN]]
-        reported = [truth is not None for truth in truths]
+        lacking = [place.number for truth, (_, place) in zip(truths, infos[OWN], strict=True) if truth is None]
     else:
         truths = infos.get("ground_truth")
-        reported = infos.get("_ground_truth", truths is not None)
+        lacking = np.flatnonzero(~np.atleast_1d(infos.get("_ground_truth", truths is not None)))
     wanted = "--ground-truth-coef needs ground_truth in every info, of every reset and step"
-    if not np.all(reported):
-        raise RunError(f"{wanted}; environment {int(np.argmin(np.atleast_1d(reported)))} reports none; use 0")
+    if len(lacking):
+        raise RunError(f"{wanted}; environment {lacking[0]} reports none; use 0")
     try:
         truth = np.asarray(truths, np.float32)
     except (TypeError, ValueError):

@@ -76,10 +76,15 @@ def as_flags(values: dict[str, Any]) -> str:
 def check_args(args: Any) -> None:
     """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work."""
     for name, kind in get_type_hints(type(args), include_extras=True).items():
-        value, parts = getattr(args, name), (kind, *get_args(kind))  # float | None has its bounds in a part
-        for bounds in (each for part in parts for each in getattr(part, "__metadata__", ())):
-            if isinstance(bounds, Bounds) and value is not None and not bounds.include(value):
+        value = getattr(args, name)
+        for part in (kind, *get_args(kind)):  # float | None has its bounds in a part
+            bounds = next((each for each in getattr(part, "__metadata__", ()) if isinstance(each, Bounds)), None)
+            if bounds is None or value is None:
+                continue
+            if not bounds.include(value):
                 raise ValueError(f"{flag(name)} is {value}; it must be {bounds}")
+            if get_args(part)[0] is int and not is_whole(value):  # in Python; tyro reads 1e6 as an integer
+                raise ValueError(f"{flag(name)} is {value!r}; it must be an integer")
         if get_origin(kind) is Literal and value not in get_args(kind):  # in Python; tyro checks the command line
             raise ValueError(f"{flag(name)} is {value!r}; it must be one of {', '.join(get_args(kind))}")
         if isinstance(value, int) and value >= 2**63:  # torch and NumPy take no more

@@ -144,6 +144,8 @@ def report_out_of_memory(
     try:
         yield
     except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RunError) or error.__cause__ is not None:  # an environment's, see `Lane`
+            raise
         if isinstance(error, RuntimeError) and not re.search("allocate|out of memory|overflowed", str(error)):
             raise
         harmless = ("seed", "total_timesteps", "start_level", "num_levels", "anneal_steps", "num_minibatches")

@@ -281,6 +281,13 @@ def test_a_training_that_diverges(tiny, opened, script):
     assert message == "spoilt.pt holds weights that are not finite: the training diverged"
 
 
+@pytest.mark.parametrize(("name", "value"), [("total_timesteps", 1e6), ("eval_interval", 1.5), ("seed", True)])
+def test_a_number_that_is_no_integer(tiny, name, value):
+    """On the command line, 1e6 is one."""
+    with pytest.raises(ValueError, match=f"--{name.replace('_', '-')} is {value}; it must be an integer"):
+        check_args(tiny(**{name: value}))
+
+
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_a_choice_that_there_is_not(tiny, script):
     """On the command line tyro finds it."""

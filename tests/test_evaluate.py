@@ -198,6 +198,7 @@ def test_the_same_step_twice_is_refused():
         "preset",
         "torch_deterministic",
         "cuda",
+        "async_envs",
         "track",
         "capture_video",
         "save_model",
@@ -220,6 +221,15 @@ def test_other_tasks_are_apart():
     assert evaluate.tasks_of(runs, evaluate.task_of) == {
         "MysteryPath-v0": {"ppo_gru": ["a", "c"]},
         'MysteryPath-v0 {"show_goal": [true]}': {"ppo_gru": ["b", "d"]},
+    }
+    runs = {
+        "a": arguments(env_id="Maze-v0", env_kwargs='{"size": 9}'),
+        "b": arguments(env_id="Maze-v0", env_kwargs='{"size":9}', seed=2),
+        "c": arguments(env_id="Maze-v0", env_kwargs='{"size": 17}'),
+    }
+    assert evaluate.tasks_of(runs, evaluate.task_of) == {
+        'Maze-v0 {"size": 9}': {"ppo_gru": ["a", "b"]},
+        'Maze-v0 {"size": 17}': {"ppo_gru": ["c"]},
     }
 
 
@@ -604,6 +614,8 @@ def test_other_levels(agents):
     assert ", levels 17 to 20, " in title
     assert ", levels 12 to 15 (of its training), " in scores_of(agents, start_level=12)[1]
     assert ", levels 1 to 4, " in scores_of(agents, start_level=1)[1], "below the first level of the training"
+    without_levels = arguments(num_levels=0, start_level=100)
+    assert ", levels 90 to 139, " in evaluate.title_of(without_levels, evaluate.Config(start_level=90))
 
 
 def test_reset_options_over_those_of_the_training(tiny):
@@ -730,6 +742,7 @@ BAD = {
     "--curves results": "results is a folder of results; give the files themselves, as results/\\*.json.gz",
     "--curves RUN --metrics coins": "of MysteryPath-Grid-v0 .* no curve of coins .* all have .*eval/success",
     "--curves RUN --out no/where": "there is no folder no to write to",
+    "--curves RUN --out empty/": "--out empty/ is a folder; give the files' name too, as empty/curves",
     "--curves old --over time": "old has no charts/seconds_iteration, .*; draw it --over steps, or leave it out",
 }
 

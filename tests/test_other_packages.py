@@ -404,6 +404,17 @@ def test_an_error_in_another_process():
     envs.close()
 
 
+def test_an_error_that_sounds_as_if_memory_were_too_small(tiny):
+    def see(env):
+        if env.t == 2:
+            raise ValueError("the list of rooms overflowed")
+        return np.zeros(1, np.float32)
+
+    says = r"environment \d raised ValueError in step 2 .*: the list of rooms overflowed"
+    with pytest.raises(RuntimeError, match=says):
+        ppo_gru.main(tiny(env_id=small(see=see)))
+
+
 # ---- videos ----
 def marked(number, bits=8, side=16):
     """A picture whose columns are the bits of a number."""
