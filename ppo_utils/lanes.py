@@ -54,10 +54,14 @@ class UnfitError(ValueError):
     """An observation or a reward is not what it should be."""
 
 
+class LaneError(RuntimeError):
+    """What an environment raised, and which environment it was."""
+
+
 class Lane(gym.Wrapper):
     """One environment of several. Its errors say which one it was and how to get there again.
 
-    What it raises becomes the cause of a RuntimeError. An observation that does not fit its space (see `check_fits`),
+    What it raises becomes the cause of a LaneError. An observation that does not fit its space (see `check_fits`),
     or a reward that is not one number, is a RunError. Both have the number of the lane, the seed that the environment
     was last reset with, and the number of the step since then, which infos have too, for what is found later.
 
@@ -73,7 +77,7 @@ class Lane(gym.Wrapper):
         self._seed, self._steps, self._rng = None, 0, np.random.default_rng()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment. Raises RuntimeError for what it raises, RunError for what it should not return."""
+        """Reset the environment. Raises LaneError for what it raises, RunError for what it should not return."""
         if seed is not None:
             self._rng = np.random.default_rng(seed)
         elif self._levels.count:
@@ -86,7 +90,7 @@ class Lane(gym.Wrapper):
             return observation, {OWN: (dict(info), self._place)}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Step the environment. Raises RuntimeError for what it raises, RunError for what it should not return."""
+        """Step the environment. Raises LaneError for what it raises, RunError for what it should not return."""
         self._steps += 1
         with self._located(""):
             observation, reward, terminated, truncated, info = self.env.step(action)
@@ -118,13 +122,14 @@ class Lane(gym.Wrapper):
             raise RunError(f"{self.unwrapped.spec.id}: {error} ({self._place})") from None
         except Exception as error:
             what = f"environment {self._number} raised {type(error).__name__} in {where}{self._place.step}"
-            raise RuntimeError(": ".join(filter(None, [what, one_line(error)]))) from error
+            raise LaneError(": ".join(filter(None, [what, one_line(error)]))) from error
 
 
 class AsyncLanes(AsyncVectorEnv):
     """Lanes in processes of their own. One that dies is a RunError; after an error, closing waits for none of them."""
 
-    def __init__(self, lanes: list[Callable[[], gym.Env]]):
+    def __init__(self, lanes: list[Callable[[], gym.Env]], first_lane: int):
+        self._first_lane = first_lane  # the number of the first one, among those of all processes
         self._pending = False  # a call has begun, and has not come to its end
         # Not all spaces can be in shared memory.
         super().__init__(lanes, autoreset_mode=AutoresetMode.SAME_STEP, shared_memory=False)
@@ -152,7 +157,7 @@ class AsyncLanes(AsyncVectorEnv):
             yield
             self._pending = False
         except (EOFError, ConnectionError) as error:
-            for lane, process in enumerate(self.processes):
+            for lane, process in enumerate(self.processes, self._first_lane):
                 process.join(1)
                 if process.exitcode is not None:
                     code = process.exitcode
@@ -179,7 +184,10 @@ def same_step_envs(
     check_kwargs(spec.id, creator(spec.entry_point), kwargs)
     make = functools.partial(make_lane, spec, kwargs, levels, asynchronous)
     lanes = [functools.partial(make, first_lane + lane) for lane in range(num_envs)]
-    envs = AsyncLanes(lanes) if asynchronous else SyncVectorEnv(lanes, autoreset_mode=AutoresetMode.SAME_STEP)
+    if asynchronous:
+        envs = AsyncLanes(lanes, first_lane)
+    else:
+        envs = SyncVectorEnv(lanes, autoreset_mode=AutoresetMode.SAME_STEP)
     envs.spec = spec
     return envs
 

@@ -48,6 +48,7 @@ from ppo_utils.checkpoints import (
 from ppo_utils.environments import envs_for
 from ppo_utils.evaluation import REPEATS, evaluate, evaluation_levels
 from ppo_utils.flags import as_flags, check_args, check_minibatches, flag
+from ppo_utils.lanes import LaneError
 from ppo_utils.processes import (
     RunError,
     all_gather,
@@ -144,7 +145,7 @@ def report_out_of_memory(
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RunError) or error.__cause__ is not None:  # an environment's, see `Lane`
+        if isinstance(error, (RunError, LaneError)):  # not an allocator's, whatever the text says
             raise
         if isinstance(error, RuntimeError) and not re.search("allocate|out of memory|overflowed", str(error)):
             raise

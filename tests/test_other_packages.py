@@ -138,6 +138,12 @@ def test_a_ground_truth_that_not_all_report(reports, lane, tiny):
         ppo_gru.main(tiny(env_id=small(count=itertools.count(), tell=tell), ground_truth_coef=0.1))
 
 
+def test_the_environments_of_a_second_process_have_the_numbers_that_follow(tiny):
+    _, infos = make_envs(small(), 2, seed=1, first_lane=6).reset()
+    with pytest.raises(RunError, match="environment 6 reports none"):
+        ground_truth_of(infos, tiny(ground_truth_coef=0.1))
+
+
 @pytest.mark.parametrize("truth", ["text", np.nan, [[1.0]], None, lambda env: np.ones(1 + env.t)])
 def test_a_ground_truth_that_is_none(tiny, truth):
     tell = lambda env: {"ground_truth": truth(env) if callable(truth) else truth}  # noqa: E731
@@ -404,7 +410,8 @@ def test_an_error_in_another_process():
     envs.close()
 
 
-def test_an_error_that_sounds_as_if_memory_were_too_small(tiny):
+@pytest.mark.parametrize("async_envs", [False, True])
+def test_an_error_that_sounds_as_if_memory_were_too_small(tiny, async_envs):
     def see(env):
         if env.t == 2:
             raise ValueError("the list of rooms overflowed")
@@ -412,7 +419,7 @@ def test_an_error_that_sounds_as_if_memory_were_too_small(tiny):
 
     says = r"environment \d raised ValueError in step 2 .*: the list of rooms overflowed"
     with pytest.raises(RuntimeError, match=says):
-        ppo_gru.main(tiny(env_id=small(see=see)))
+        ppo_gru.main(tiny(env_id=small(see=see), async_envs=async_envs))
 
 
 # ---- videos ----
@@ -643,9 +650,10 @@ def test_a_reward_is_one_number(asynchronous):
 
 
 def test_a_process_that_dies():
-    envs = make_envs(small(earn=lambda env: os._exit(3) if env.t == 2 else 0.0), 2, seed=1, asynchronous=True)
+    dying = small(earn=lambda env: os._exit(3) if env.t == 2 else 0.0)
+    envs = make_envs(dying, 2, seed=1, first_lane=6, asynchronous=True)
     envs.reset()
-    with pytest.raises(RunError, match=r"the process of environment \d ended, with exit code 3"):
+    with pytest.raises(RunError, match=r"the process of environment [67] ended, with exit code 3"):
         list(roll(envs, 3))
     envs.close()
     assert not any(process.is_alive() for process in envs.unwrapped.processes)
