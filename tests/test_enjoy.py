@@ -512,9 +512,11 @@ def watch(browser, saved, tmp_path_factory):
     def open_page(step):
         if not path.exists():
             options = '{"command_count": [16]}'  # 64 steps to show them
-            saved(ppo_trxl, env_id="MortarMayhem-Grid-v0", trxl_memory_length=128, env_options=options)
+            agent = f"{'a_long_name_' * 8}/model.pt"
+            Path(agent).parent.mkdir()
+            saved(ppo_trxl, agent, env_id="MortarMayhem-Grid-v0", trxl_memory_length=128, env_options=options)
             saved(path="other.pt", env_id="MortarMayhem-Grid-v0", env_options=options)
-            enjoy.main(enjoy.Config("model.pt", ("other.pt",), seed=3, out=str(path)))
+            enjoy.main(enjoy.Config(agent, ("other.pt",), seed=3, out=str(path)))
         browser.get("about:blank")  # or the same page at another step would not be loaded anew
         browser.get(f"{path.as_uri()}#{step}")
         page = data_of(path.read_text())["episodes"][0]
