@@ -22,8 +22,9 @@ How to read: section 2 is the training loop and what it calls, from the top down
 environments, evaluation, run folder, checkpoints, several processes, and faster ways to compute the same.
 
 Shape letters: T steps of a rollout, N environments, A action branches, B steps of a minibatch, S segments in it, L
-steps of its longest segment, W window, M keys that are attended to, K blocks, H attention heads, D width of the memory
-and I of its input (the same), F features of the trunk, G entries of the ground truth.
+steps of its longest segment, W window, M keys that are attended to, K blocks, R hidden states that a step stores (K, or
+K + 1), H attention heads, D width of the memory and I of its input (the same), F features of the trunk, G entries of
+the ground truth.
 """
 
 from __future__ import annotations
@@ -683,7 +684,7 @@ class MemoryState:
     now: int  # row of the step that comes next
     episode_step: Tensor  # (N,) which step of its episode that is
     row_step: Tensor  # (W + T, N) which step of its episode each row is
-    hidden: Tensor  # (W + T, N, K + 1, D) the input of every block, and the last one's output
+    hidden: Tensor  # (W + T, N, R, D) the inputs of the K blocks, and with --trxl-query-output the last one's output
     keys: Tensor  # (K, N, W + T, D) projections of the blocks' inputs, a cache for acting
     values: Tensor  # (K, N, W + T, D)
 
@@ -691,7 +692,7 @@ class MemoryState:
 class Memory(nn.Module):
     """Transformer-XL as an episodic memory with a sliding window (§5.3), or GTrXL.
 
-    Every step stores the inputs of the K blocks, and the last one's output for --trxl-query-output. A step's query in
+    Every step stores the inputs of the K blocks, with --trxl-query-output the last one's output too. A step's query in
     block k attends to the inputs of block k at up to W steps before it, of the same episode, never to its own. What no
     query attends to is set to zero before it is read: a mask alone would let a NaN pass (0 * NaN is NaN). Raises
     ValueError for a width that does not fit, and for flags that would change nothing.
@@ -720,6 +721,7 @@ class Memory(nn.Module):
         if self.encoding == "learned":
             self.table = nn.Parameter(torch.randn(args.trxl_pe_length + 1, self.width) / math.sqrt(self.width))
         self.query_output = nn.Linear(self.width, self.width, bias=False) if args.trxl_query_output else None
+        self.stored = args.trxl_num_layers + args.trxl_query_output  # R
 
     @staticmethod
     def input_width(args: Args) -> int:
@@ -739,7 +741,7 @@ class Memory(nn.Module):
             now=self.window,
             episode_step=torch.zeros(num_envs, dtype=torch.int64),
             row_step=torch.zeros(rows, num_envs, dtype=torch.int64),
-            hidden=torch.zeros(rows, num_envs, num_blocks + 1, self.width, device=device),
+            hidden=torch.zeros(rows, num_envs, self.stored, self.width, device=device),
             keys=torch.zeros(cache_shape, dtype=self.cache_dtype, device=device),
             values=torch.zeros(cache_shape, dtype=self.cache_dtype, device=device),
         )
@@ -757,7 +759,7 @@ class Memory(nn.Module):
         state.row_step[: self.window] = carry["row_step"]
         state.hidden[: self.window] = carry["hidden"]
         rows, _, mask = self.attended_rows(state)
-        hidden = state.hidden[rows].masked_fill(~mask[:, 0].T[..., None, None], 0.0)  # (M, N, K + 1, D)
+        hidden = state.hidden[rows].masked_fill(~mask[:, 0].T[..., None, None], 0.0)  # (M, N, R, D)
         position = self.position(state.row_step[rows].to(hidden.device), hidden.dtype)  # (M, N, D)
         for k, block in enumerate(self.blocks):
             keys, values = block.keys_values(hidden[:, :, k] + position)
@@ -765,7 +767,7 @@ class Memory(nn.Module):
             state.values[k, :, rows] = values.transpose(0, 1)
 
     def step(self, state: MemoryState, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute one step of all environments, x (N, D): the output (N, D) and hidden states (N, K + 1, D)."""
+        """Compute one step of all environments, x (N, D): the output (N, D) and what is stored of it (N, R, D)."""
         rows, age, mask = self.attended_rows(state)
         x = x[:, None]  # (N, 1, D)
         query = self.first_query(x, state.episode_step.to(x.device)[:, None], state.hidden[state.now - 1, :, -1:])
@@ -774,11 +776,11 @@ class Memory(nn.Module):
             # After the first block, the query is the block's input.
             x = query = block(x, query, (state.keys[k][:, rows], state.values[k][:, rows]), age, mask)
             hidden.append(x)
-        return x[:, 0], torch.cat(hidden, 1)
+        return x[:, 0], torch.cat(hidden[: self.stored], 1)
 
     @torch.no_grad()
     def advance(self, state: MemoryState, hidden: Tensor) -> None:
-        """Store the step's hidden states (N, K + 1, D), cache their keys and values, and move on."""
+        """Store the step's hidden states (N, R, D), cache their keys and values, and move on."""
         if state.now == len(state.row_step):
             raise IndexError("there is no room for this step; begin_rollout(state, carry(state)) makes room again")
         state.hidden[state.now] = hidden
@@ -830,7 +832,7 @@ class Memory(nn.Module):
         key_columns = torch.arange(-length, len(columns) - 1)  # (M,)
         key_rows = (row + key_columns).clamp(max=last_row)  # (S, M)
         key_step = state.row_step[key_rows, env].to(device)  # (S, M)
-        hidden = state.hidden[key_rows.to(device), env.to(device)]  # (S, M, K + 1, D)
+        hidden = state.hidden[key_rows.to(device), env.to(device)]  # (S, M, R, D)
         age, query_step = (columns[:, None] - key_columns).to(device), query_step.to(device)  # (L, M), (S, L)
         mask = attention_mask(age, query_step[..., None], self.window)  # (S, L, M)
         attended = mask.any(1)[..., None]  # (S, M, 1)

@@ -243,7 +243,8 @@ def load_model(args: Any, agent: nn.Module, script: str) -> None:
     if saved["script"] != script:
         raise ValueError(f"{path} was trained by {saved['script']}.py, not by {script}.py")
     theirs = saved_args(type(args), saved)
-    differ = [name for name in agent.memory.flags if getattr(args, name) != getattr(theirs, name)]
+    flags = (*agent.memory.flags, "frame_stack")  # a stack of three gray images is as large as an image of three colors
+    differ = [name for name in flags if getattr(args, name) != getattr(theirs, name)]
     if differ:
         ours, theirs = (as_flags({name: getattr(each, name) for name in differ}) for each in (args, theirs))
         raise ValueError(f"{path} was trained with {theirs}, not with {ours}")
@@ -259,8 +260,10 @@ def load_learner(run: Run, saved: dict[str, Any], folder: str | Path) -> None:
     try:
         for optimizer, state in zip(run.optimizers, saved["optimizers"], strict=True):
             optimizer.load_state_dict(state)
+        shapes = {name: part.shape for name, part in run.rollout.initial_memory.items()}
         for process in saved["processes"]:
-            if process["memory"].keys() != run.rollout.initial_memory.keys() or "return_scale" not in process:
+            theirs = {name: part.shape for name, part in process["memory"].items()}
+            if theirs != shapes or "return_scale" not in process:
                 raise KeyError
     except (KeyError, ValueError):
         raise ValueError(

@@ -75,18 +75,21 @@ def as_flags(values: dict[str, Any]) -> str:
 
 def check_args(args: Any) -> None:
     """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work."""
+    plain = get_type_hints(type(args))
     for name, kind in get_type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
+        is_choice = get_origin(kind) is Literal
+        kinds = (str,) if is_choice else get_args(plain[name]) or (plain[name],)  # float | None has two
+        # Two checks for what is given in Python; tyro has them for the command line. A file with a Path, or with a
+        # number of NumPy's, could not be read again.
+        if type(value) not in kinds and not (type(value) is int and float in kinds):
+            raise ValueError(f"{flag(name)} is {value!r}; it must be of type {kinds[0].__name__}")
+        if is_choice and value not in get_args(kind):
+            raise ValueError(f"{flag(name)} is {value!r}; it must be one of {', '.join(get_args(kind))}")
         for part in (kind, *get_args(kind)):  # float | None has its bounds in a part
             bounds = next((each for each in getattr(part, "__metadata__", ()) if isinstance(each, Bounds)), None)
-            if bounds is None or value is None:
-                continue
-            if not bounds.include(value):
+            if bounds is not None and value is not None and not bounds.include(value):
                 raise ValueError(f"{flag(name)} is {value}; it must be {bounds}")
-            if get_args(part)[0] is int and not is_whole(value):  # in Python; tyro reads 1e6 as an integer
-                raise ValueError(f"{flag(name)} is {value!r}; it must be an integer")
-        if get_origin(kind) is Literal and value not in get_args(kind):  # in Python; tyro checks the command line
-            raise ValueError(f"{flag(name)} is {value!r}; it must be one of {', '.join(get_args(kind))}")
         if isinstance(value, int) and value >= 2**63:  # torch and NumPy take no more
             raise ValueError(f"{flag(name)} is {value}; it must be below 2 ** 63")
     if not args.exp_name or set(args.exp_name) & set("/\\"):

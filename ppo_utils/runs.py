@@ -252,8 +252,9 @@ def start_tracking(args: Any, name: str) -> None:
         import wandb
     except ImportError:
         raise ImportError('--track needs wandb: pip install -e ".[track]"') from None
+    how = {"resume": "allow", "reinit": "finish_previous", "sync_tensorboard": True, "save_code": True}
     try:
-        wandb.init(name=name, id=name, resume="allow", sync_tensorboard=True, config=asdict(args), save_code=True)
+        wandb.init(name=name, id=name, config=asdict(args), **how)
     except Exception as error:  # whatever wandb raises: no account, no such team, no network
         raise ValueError(f"--track: {error}; log in with `wandb login`, or leave --track out") from None
 

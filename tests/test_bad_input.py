@@ -8,8 +8,10 @@ import subprocess
 import sys
 import types
 from dataclasses import asdict
+from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 from conftest import SCRIPTS, parse_args
@@ -212,6 +214,13 @@ def test_a_run_folder_that_cannot_be_written(tmp_path, tiny):
         ppo_gru.setup(tiny(env_id="CueRecall-v0"))
 
 
+def test_a_model_of_colors_for_a_stack_of_three_gray_images(tiny):
+    shared = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "pixels"}
+    folder = ppo_gru.main(tiny(**shared, save_model=True))
+    with pytest.raises(ValueError, match="was trained with --frame-stack 0, not with --frame-stack 3"):
+        ppo_gru.setup(tiny(**shared, load_model=f"{folder}/model.pt", frame_stack=3))
+
+
 def test_a_model_of_another_network(tiny):
     folder = ppo_gru.main(tiny(env_id="CueRecall-v0", save_model=True))
     path = os.path.join(folder, "model.pt")
@@ -281,11 +290,31 @@ def test_a_training_that_diverges(tiny, opened, script):
     assert message == "spoilt.pt holds weights that are not finite: the training diverged"
 
 
-@pytest.mark.parametrize(("name", "value"), [("total_timesteps", 1e6), ("eval_interval", 1.5), ("seed", True)])
-def test_a_number_that_is_no_integer(tiny, name, value):
-    """On the command line, 1e6 is one."""
-    with pytest.raises(ValueError, match=f"--{name.replace('_', '-')} is {value}; it must be an integer"):
+@pytest.mark.parametrize(
+    ("name", "value", "kind"),
+    [
+        ("total_timesteps", 1e6, "int"),  # an integer on the command line
+        ("eval_interval", 1.5, "int"),
+        ("seed", True, "int"),
+        ("seed", np.int64(1), "int"),
+        ("init_lr", np.float64(3e-4), "float"),  # of np.geomspace; the files could not be read again
+        ("target_kl", np.float32(0.1), "float"),
+        ("gamma", "0.99", "float"),
+        ("step_encoding", np.True_, "bool"),
+        ("load_model", Path("model.pt"), "str"),
+        ("env_options", {"command_count": [3]}, "str"),
+        ("optimizer", np.str_("muon"), "str"),
+    ],
+)
+def test_a_value_of_another_type(tiny, name, value, kind):
+    message = f"--{name.replace('_', '-')} is {value!r}; it must be of type {kind}"
+    with pytest.raises(ValueError, match=re.escape(message)):
         check_args(tiny(**{name: value}))
+
+
+@pytest.mark.parametrize("changes", [{"gamma": 1}, {"target_kl": None}, {"target_kl": 1}])
+def test_an_integer_is_a_float_and_none_is_optional(tiny, changes):
+    check_args(tiny(**changes))
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

@@ -271,7 +271,7 @@ def test_a_checkpoint_holds_what_the_next_rollout_begins_with(tiny):
     folder = ppo_trxl.main(tiny(ppo_trxl, **GRID, **changes))
     memory = read_checkpoint(folder)["processes"][0]["memory"]
     assert {name: tuple(part.shape) for name, part in memory.items()} == {
-        "hidden": (7, 4, 3, 32), "row_step": (7, 4), "episode_step": (4,)
+        "hidden": (7, 4, 2, 32), "row_step": (7, 4), "episode_step": (4,)
     }  # fmt: skip
     folder = ppo_gru.main(tiny(**GRID, **changes))
     (hidden,) = read_checkpoint(folder)["processes"][0]["memory"].values()
@@ -389,7 +389,7 @@ def test_a_folder_that_cannot_be_written(trained, monkeypatch):
         resumed(ppo_gru, trained)
 
 
-@pytest.mark.parametrize("missing", ["memory", "return_scale", "optimizers", "optimizer"])
+@pytest.mark.parametrize("missing", ["memory", "hidden states", "return_scale", "optimizers", "optimizer"])
 def test_a_checkpoint_of_another_version(tiny, missing):
     folder = ppo_trxl.main(tiny(ppo_trxl, **GRID, capture_video=False))
     path = folder / "checkpoint-128.pt"
@@ -397,6 +397,9 @@ def test_a_checkpoint_of_another_version(tiny, missing):
     if missing == "memory":  # a transformer's was before: the whole rollout, by other names
         memory = saved["processes"][0]["memory"]
         saved["processes"][0]["memory"] = {"items": memory["hidden"], "episode_step": memory["episode_step"]}
+    elif missing == "hidden states":  # before, the last block's output was stored always
+        memory = saved["processes"][0]["memory"]
+        memory["hidden"] = torch.cat([memory["hidden"], memory["hidden"][:, :, -1:]], 2)
     elif missing == "return_scale":
         del saved["processes"][0]["return_scale"]
     elif missing == "optimizers":

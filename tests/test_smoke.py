@@ -232,6 +232,7 @@ def test_tracking(tiny, monkeypatch):
     assert started["sync_tensorboard"]
     assert started["name"] == started["id"] == os.path.basename(folder)
     assert started["resume"] == "allow", "a resumed run goes on with the same one"
+    assert started["reinit"] == "finish_previous", "a second training in this process has a run of its own"
     assert started["config"]["env_id"] == "CueRecall-v0"
 
 

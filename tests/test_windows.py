@@ -50,7 +50,7 @@ def make_timeline(memory, seed=1):
     """Random hidden states, and steps of episodes that end at random; in environment 0 one ends before the rollout."""
     generator = torch.Generator().manual_seed(seed)
     rows = memory.window + STEPS
-    hidden = torch.randn(rows, LANES, len(memory.blocks) + 1, WIDTH, dtype=torch.float64, generator=generator)
+    hidden = torch.randn(rows, LANES, memory.stored, WIDTH, dtype=torch.float64, generator=generator)
     ends = torch.rand(rows, LANES, generator=generator) < 0.15
     ends[memory.window, 0] = True
     steps = torch.zeros(rows, LANES, dtype=torch.int64)
