@@ -343,9 +343,9 @@ def train_missing(config: Training, wanted: list[Plan]) -> None:
     missing = [plan for plan in wanted if result_of(config, plan) is None]
     steps = sum(plan.args.total_timesteps for plan in missing)
     if missing:
-        tqdm.write(
-            f"{len(missing)} runs to train, {steps:,} steps, {config.jobs} at a time{expected_hours(config, missing)}"
-        )
+        runs = "run" if len(missing) == 1 else "runs"
+        hours = expected_hours(config, missing)
+        tqdm.write(f"{len(missing)} {runs} to train, {steps:,} steps, {config.jobs} at a time{hours}")
     before = sum(steps_so_far(config, plan) for plan in missing)  # of trainings that were stopped
     failed = []
     with (

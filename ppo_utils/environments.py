@@ -456,19 +456,11 @@ def final_observations(
 
 
 class EpisodeStatistics(Saved, RecordEpisodeStatistics):
-    """Gymnasium's statistics of ended episodes, which can be saved, but for the seconds: those start again."""
+    """Gymnasium's statistics of ended episodes, with a state: of the episodes that go on, without their seconds."""
 
     kept = ("episode_count", "episode_returns", "episode_lengths", "prev_dones")
-    queues = ("return_queue", "length_queue")
-
-    def get_state(self) -> dict[str, Any]:
-        """Return returns and lengths so far, and those of the last ended episodes."""
-        return {**super().get_state(), **{name: np.array(getattr(self, name)) for name in self.queues}}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Take over a copy of what get_state() returned."""
         super().set_state(state)
-        for name in self.queues:
-            getattr(self, name).clear()
-            getattr(self, name).extend(state[name])
         self.episode_start_times = np.full(self.num_envs, time.perf_counter())

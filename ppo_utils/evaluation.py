@@ -44,24 +44,22 @@ def evaluate(
     *,
     amp: bool = False,
     deterministic: bool = False,
-    memory_steps: int = MEMORY_STEPS,
 ) -> dict[str, np.ndarray]:
     """Play each of the levels (N,) in an environment of its own, with the stochastic policy (§6.1.3).
 
     With deterministic, actions are the most probable ones.
 
     Returns metrics (N,) by name: return, length, finished (0 for an episode that max_steps cut short), and every number
-    in an episode's final info, NaN where an episode did not report it. The memory begins empty, and has room for
-    memory_steps steps at a time.
+    in an episode's final info, NaN where an episode did not report it. The memory begins empty.
     """
     device = next(agent.parameters()).device
     obs, _ = envs.reset(seed=levels)
-    memory = agent.memory.initial_state(len(levels), memory_steps, device)
+    memory = agent.memory.initial_state(len(levels), MEMORY_STEPS, device)
     playing = np.ones(len(levels), bool)
     metrics = {"return": np.zeros(len(levels)), "length": np.zeros(len(levels))}
     with torch.autocast(device.type, torch.bfloat16, enabled=amp):
         for t in range(max_steps):
-            if t % memory_steps == 0:
+            if t % MEMORY_STEPS == 0:
                 agent.memory.begin_rollout(memory, agent.memory.carry(memory))
             if deterministic:
                 actions = most_probable(agent, as_tensors(obs, device), memory)

@@ -17,7 +17,7 @@ from memory_gym_envs.base import lane_seeds
 from memory_gym_envs.options import brief
 from ppo_utils.lanes import OWN, Place
 from ppo_utils.processes import RunError
-from ppo_utils.wrappers import OBSERVATION, one_hot
+from ppo_utils.wrappers import OBSERVATION, one_hot, rows_of
 
 SMALLEST_IMAGE = 36  # pixels along a side; what is smaller becomes a vector
 WRITABLE = ("C_CONTIGUOUS", "WRITEABLE")  # wrappers overwrite observations in place
@@ -240,15 +240,6 @@ def within(values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float
         index = tuple(np.argwhere(wrong)[0].tolist())
         low, high = (np.broadcast_to(bound, values.shape)[index] for bound in (low, high))
         raise WrongValue(index[0], f"is {values[index]}, outside of {low} to {high}")
-
-
-def rows_of(observations: Any, rows: np.ndarray) -> Any:
-    """Return some rows of a batch of observations, in dicts and tuples too."""
-    if isinstance(observations, dict):
-        return {name: rows_of(part, rows) for name, part in observations.items()}
-    if isinstance(observations, tuple):
-        return tuple(rows_of(part, rows) for part in observations)
-    return np.asarray(observations)[rows]
 
 
 def is_text(space: gym.Space) -> bool:

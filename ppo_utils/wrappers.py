@@ -71,19 +71,19 @@ class SameStepWrapper(Saved, VectorWrapper):
         seeds = lane_seeds(seed, self.num_envs)
         observations, infos = self.env.reset(seed=seed, options=options)
         lanes = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-        self.begin(_rows(observations, lanes), lanes, seeds)
+        self.begin(rows_of(observations, lanes), lanes, seeds)
         return self.wrap(observations, ALL), infos
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Step every lane, its observations wrapped, those in `final_obs` too."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         (ended,) = (terminated | truncated).nonzero()
-        first = _rows(observations, ended)
+        first = rows_of(observations, ended)
         if ended.size:  # what was seen before the reset
             overwrite(observations, ended, _batched(infos["final_obs"][ended]))
         self.advance(observations, np.asarray(actions), rewards)
         if ended.size:
-            last = self.wrap(_rows(observations, ended), ended)
+            last = self.wrap(rows_of(observations, ended), ended)
             for row, lane in enumerate(ended.tolist()):
                 infos["final_obs"][lane] = one_of(last, row)
             overwrite(observations, ended, first)
@@ -431,11 +431,13 @@ def sinusoidal(positions: np.ndarray, width: int) -> np.ndarray:
     return np.stack([np.sin(angles), np.cos(angles)], axis=2).reshape(-1, width).astype(np.float32)
 
 
-def _rows(observations: Any, lanes: np.ndarray) -> Any:
-    """Return copies of the lanes' observations."""
+def rows_of(observations: Any, rows: np.ndarray) -> Any:
+    """Return some rows of a batch of observations, in dicts and tuples too."""
     if isinstance(observations, dict):
-        return {key: values[lanes] for key, values in observations.items()}
-    return observations[lanes]
+        return {name: rows_of(part, rows) for name, part in observations.items()}
+    if isinstance(observations, tuple):
+        return tuple(rows_of(part, rows) for part in observations)
+    return np.asarray(observations)[rows]
 
 
 def _batched(observations: np.ndarray) -> Any:

@@ -84,10 +84,14 @@ def test_an_environment_s_own_return(played, script, monkeypatch):
     assert (evaluated(args, run)["return"] == before["return"]).all()
 
 
-def test_the_memory_is_carried_from_stretch_to_stretch(played):
+def test_the_memory_is_carried_from_stretch_to_stretch(played, monkeypatch):
     """Episodes longer than a stretch: the window's cache, refreshed, is what it was."""
     args, run, *_ = played(script=ppo_trxl, env_id="MysteryPath-Grid-v0", weights_scale=5.0, **FEW)
-    whole, short = (evaluated(args, run, max_steps=40, memory_steps=steps) for steps in (1000, 3))
+    found = []
+    for steps in (1000, 3):
+        monkeypatch.setattr(evaluation, "MEMORY_STEPS", steps)
+        found.append(evaluated(args, run, max_steps=40))
+    whole, short = found
     assert whole["length"].max() > 30
     for name, numbers in whole.items():
         assert np.array_equal(numbers, short[name], equal_nan=True), name
