@@ -59,7 +59,8 @@ try:
 except ImportError as error:
     raise SystemExit(f'evaluate.py needs {error.name}: pip install -e ".[eval]"') from None
 
-MOST_EPISODES = 100_000  # played at once
+MOST_EPISODES = 100_000
+AT_ONCE = 1000  # episodes; more would take much memory
 # A family's own metric (6.1.3), by the beginning of the id; any other environment's is the return.
 OWN_METRIC = {
     "MortarMayhem": "commands_completed",
@@ -675,13 +676,19 @@ def play(checkpoint: Checkpoint, config: Config) -> dict[str, np.ndarray]:
     args = checkpoint.args
     device = torch.device("cuda" if torch.cuda.is_available() and config.cuda else "cpu")
     levels = evaluation_levels(args, config.levels, config.repeats, config.start_level)
-    envs = envs_for(args, len(levels), asynchronous=False)  # a process for each episode would be many
-    _, infos = envs.reset()
-    agent = make_agent(checkpoint.script.Agent, envs, infos, args).to(device)
-    load_weights(agent, checkpoint.saved, checkpoint.path)
-    torch.manual_seed(config.seed)
-    found = evaluate(agent, envs, levels, config.max_steps, amp=args.amp, deterministic=config.deterministic)
-    envs.close()
+    agent, found = None, defaultdict(lambda: np.full(len(levels), np.nan))
+    for start in range(0, len(levels), AT_ONCE):
+        batch = levels[start : start + AT_ONCE]
+        envs = envs_for(args, len(batch), asynchronous=False)  # a process for each episode would be many
+        if agent is None:
+            _, infos = envs.reset()
+            agent = make_agent(checkpoint.script.Agent, envs, infos, args).to(device)
+            load_weights(agent, checkpoint.saved, checkpoint.path)
+            torch.manual_seed(config.seed)
+        played = evaluate(agent, envs, batch, config.max_steps, amp=args.amp, deterministic=config.deterministic)
+        envs.close()
+        for name, numbers in played.items():
+            found[name][start : start + AT_ONCE] = numbers
     return {name: numbers.reshape(config.levels, config.repeats) for name, numbers in found.items()}
 
 

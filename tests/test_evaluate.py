@@ -607,6 +607,14 @@ def test_the_most_probable_actions(agents):
     assert title.endswith("levels 15 to 18, 6 times each, most probable actions")
 
 
+@pytest.mark.parametrize("at_once", [5, 12])
+def test_episodes_in_batches(agents, monkeypatch, at_once):
+    """Of 24 episodes, the last batch has four, or twelve; the repeats of a level may be in two."""
+    wanted, _ = scores_of(agents, levels=12, repeats=2, deterministic=True)
+    monkeypatch.setattr(evaluate, "AT_ONCE", at_once)
+    assert np.array_equal(scores_of(agents, levels=12, repeats=2, deterministic=True)[0], wanted)
+
+
 def test_other_levels(agents):
     usual, _ = scores_of(agents, levels=6, deterministic=True)
     moved, title = scores_of(agents, levels=4, deterministic=True, start_level=17)
