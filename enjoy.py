@@ -201,8 +201,7 @@ def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode,
     if hasattr(agent.memory, "attended_rows"):  # a transformer
         episode.attention.append(attention_of(agent.memory, memory, x)[0].numpy())
     agent.memory.advance(memory, stored)
-    logits, values, features = agent.heads(y)
-    policy = agent.heads.distributions(logits)
+    policy, values, features = agent.heads(y)
     actions = torch.stack([branch.logits.argmax(-1) if deterministic else branch.sample() for branch in policy], -1)
     episode.policy.append([branch.probs[0].numpy() for branch in policy])
     episode.actions.append(actions[0].tolist())

@@ -42,7 +42,7 @@ from torch.distributions import Categorical
 from torch.nn.utils.rnn import pad_sequence
 
 from ppo_utils.checkpoints import make_agent
-from ppo_utils.environments import as_tensors, final_numbers, final_observations, ground_truth_of, training_envs
+from ppo_utils.environments import add_ended, as_tensors, final_observations, ground_truth_of, training_envs
 from ppo_utils.fast import encode, first_occurrences, in_chunks, packed_gru
 from ppo_utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, UnitInterval, bounded
 from ppo_utils.processes import all_gather, average_gradients
@@ -135,7 +135,7 @@ class Args:
     max_grad_norm: PositiveFloat = 0.25
     """largest norm of the gradient, which is scaled down to it"""
     target_kl: PositiveFloat | None = None
-    """stop the update at a minibatch on which the approximate KL divergence from the old policy is larger (above 0)"""
+    """end the update at a minibatch whose approximate KL divergence from the rollout's policy exceeds this (above 0)"""
     optimizer: Literal["adamw", "muon"] = "adamw"
     """muon: Muon for the matrices between hidden layers, AdamW for all other weights"""
     muon_lr_ratio: bounded(float, 0, 1000, above=True) = 3.0
@@ -151,7 +151,7 @@ class Args:
     final_ent_coef: NonNegativeFloat = 1.0e-6
     """weight of the exploration bonus from --anneal-steps on"""
     anneal_steps: NonNegativeInt = 163_840_000
-    """steps of linear decay, of both; does not follow --total-timesteps (0: both stay at their initial values)"""
+    """steps over which learning rate and bonus weight decay linearly, whatever --total-timesteps is (0: no decay)"""
     reconstruction_coef: NonNegativeFloat = 0.0
     """weight of the loss of reconstructing the observed image (0: off; thesis: 0.1)"""
     reconstruction_detach: bool = False
@@ -170,7 +170,7 @@ class Args:
     eval_interval: NonNegativeInt = 0
     """iterations between evaluations on unseen levels, with another one at the end (0: no evaluations)"""
     eval_levels: PositiveInt = 50
-    """levels of an evaluation, the first after those of the training; each is played three times"""
+    """number of levels of an evaluation, which follow those of the training; each is played three times"""
     eval_max_steps: PositiveInt = 10_000
     """an evaluation cuts episodes off after this many steps"""
 
@@ -267,7 +267,7 @@ class Rollout:
     rewards: Tensor  # (T, N)
     terminated: Tensor  # (T, N) the step ended its episode
     truncated: Tensor  # (T, N) the step ended its episode by a time limit
-    truncation_values: Tensor  # (T, N) value of the final observation, where bootstrapped
+    truncation_values: Tensor  # (T, N) value of the final observation, 0 where not bootstrapped
     ground_truth: Tensor | None  # (T, N, G), if it is estimated
     next_obs: dict[str, np.ndarray]  # each (N, ...)
     next_ground_truth: np.ndarray | None  # (N, G)
@@ -318,8 +318,7 @@ def collect(
 ) -> tuple[Tensor, dict[str, list[float]]]:
     """Act for T steps in all environments; return the value (N,) of the next step, and metrics of the ended episodes.
 
-    An ended episode is reset in the same step, so that next_obs begins the next one. Metrics are lists by name:
-    charts/episodic_return, charts/episodic_length, and episode/* for every number in the environment's final info.
+    An ended episode is reset in the same step, so that next_obs begins the next one. Metrics: see `add_ended`.
     """
     device, state = rollout.values.device, rollout.memory_state
     episodes = defaultdict(list)
@@ -346,11 +345,7 @@ def collect(
             agent.memory.reset(state, torch.as_tensor(done))
             rollout.next_obs = next_obs
             rollout.next_ground_truth = ground_truth_of(infos, args, rollout.next_ground_truth)
-            if done.any():
-                episodes["charts/episodic_return"] += infos["episode"]["r"][done].tolist()
-                episodes["charts/episodic_length"] += infos["episode"]["l"][done].tolist()
-                for name, values in final_numbers(infos, done).items():
-                    episodes[f"episode/{name}"] += values[~np.isnan(values)].tolist()
+            add_ended(episodes, infos, done)
         return agent.get_value(as_tensors(rollout.next_obs, device), state), episodes
 
 
@@ -455,14 +450,14 @@ def mean_logs(step_logs: list[dict[str, Tensor]], rollout: Rollout) -> dict[str,
 
     Raises FloatingPointError if a loss or a gradient was not finite: the weights are unusable then.
     """
-    values = {name: [logs[name] for logs in step_logs if name in logs] for name in step_logs[0]}
-    losses = {name: torch.stack(each).mean().item() for name, each in values.items()}
+    logged = {name: [logs[name] for logs in step_logs if name in logs] for name in step_logs[0]}
+    losses = {name: torch.stack(each).mean().item() for name, each in logged.items()}
     if not (math.isfinite(losses["loss"]) and math.isfinite(losses["grad_norm"])):
         raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr, or smaller rewards")
     # Before the first gradient step, ratios differ from 1 by rounding only, if the update recomputes what acted.
     losses["ratio_error"] = step_logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
-    gradient_steps = len(values["grad_norm"])
+    gradient_steps = len(logged["grad_norm"])
     return {f"losses/{name}": value for name, value in losses.items()} | {"charts/gradient_steps": gradient_steps}
 
 
@@ -629,8 +624,8 @@ class Pieces:
         """
         order = torch.randperm(len(self.first))
         first, length = self.first[order], self.length[order]
-        # Of all pieces end to end, count equal parts: a piece goes where its middle lies, twice which is an integer.
-        twice_middle = 2 * length.cumsum(0) - length
+        # Divide all pieces, end to end, into count equal parts: a piece belongs to the part in which its middle lies.
+        twice_middle = 2 * length.cumsum(0) - length  # an integer
         part = twice_middle * count // (2 * length.sum())  # (S,), ascending
         sizes = part.bincount(minlength=count).tolist()
         for mb_first, mb_length in zip(first.split(sizes), length.split(sizes), strict=True):
@@ -643,8 +638,8 @@ class Pieces:
 #   carry, begin_rollout     what one rollout hands to the next; begin a rollout with it
 #   step, advance, reset     compute a step; store it and move on; forget the episodes that ended
 #   cut, unroll              cut a rollout into pieces; compute whole pieces at once in the update
-#   width                    D, the width of its output
-#   input_width, longest_piece, flags    known from the arguments alone; flags have to be those of loaded weights
+#   width, flags             D, the width of its output; the arguments that loaded weights must have been trained with
+#   input_width, longest_piece    from the arguments alone: the width of an embedding, the most steps of a piece
 # begin_rollout, advance and reset change a state in place; all others only read it.
 @dataclass
 class MemoryState:
@@ -739,10 +734,10 @@ class Memory(nn.Module):
         if self.kind == "gru" and x.device.type == "cpu":
             return packed_gru(self.rnn, x, pieces.length, hidden)  # the same without padding, and faster
         y, _ = self.recur(pieces.pad(x), hidden)  # (S, L, D)
-        return pieces.unpad(y)  # from here on, the losses' means (5.8) included, there are real steps only
+        return pieces.unpad(y)  # so that the losses are means over real steps (5.8)
 
     def recur(self, x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Run the recurrent layers over x (S, L, I) from the hidden state (S, P, D); return outputs and last one."""
+        """Run the layers over x (S, L, I) from the hidden state (S, P, D): outputs (S, L, D), last state (S, P, D)."""
         hidden = hidden.transpose(0, 1).contiguous()  # (P, S, D)
         with torch.autocast(x.device.type, enabled=False):  # rounding errors would add up from step to step
             y, hidden = self.rnn(x, hidden if self.kind == "gru" else hidden.chunk(2))
@@ -784,7 +779,7 @@ class AtariCNN(nn.Sequential):
 
 
 class Encoder(nn.Module):
-    """Encodes the images and vectors of an observation, and embeds them together in `width` (§5.1), unless None."""
+    """Encodes the images and vectors of an observation, and embeds them together (§5.1); width None: no embedding."""
 
     def __init__(self, spaces: dict[str, gym.spaces.Box], width: int | None):
         super().__init__()
@@ -821,15 +816,13 @@ class Heads(nn.Module):
         self.policy = mlp_head(size, sum(nvec), 0.1)
         self.value = mlp_head(size, 1, value_gain)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Map the memory's output (B, D) to the logits of all branches, values (B,) and features (B, F)."""
+    def forward(self, x: Tensor) -> tuple[list[Categorical], Tensor, Tensor]:
+        """Map the memory's output (B, D) to each branch's distribution, values (B,) and features (B, F)."""
         with torch.autocast(x.device.type, enabled=False):  # --amp: bfloat16 is too coarse for values and log-ratios
             features = F.relu(self.trunk(x.float()))
-            return self.policy(features), self.value(features)[:, 0], features
-
-    def distributions(self, logits: Tensor) -> list[Categorical]:
-        """Make the distribution of each branch's action from the logits of all branches."""
-        return [Categorical(logits=part, validate_args=False) for part in logits.split(self.nvec, -1)]
+            logits = self.policy(features).split(self.nvec, -1)  # A parts
+            policy = [Categorical(logits=part, validate_args=False) for part in logits]
+            return policy, self.value(features)[:, 0], features
 
 
 def mlp_head(size: int, outputs: int, gain: float) -> nn.Sequential:
@@ -865,7 +858,7 @@ class Decoder(nn.Sequential):
 
 
 class Agent(nn.Module):
-    """Encoder, memory and heads: acts step by step, and evaluates whole pieces of what it did.
+    """Encoder, memory and heads: acts step by step, and recomputes pieces of a rollout with gradient.
 
     nvec: number of actions of each branch. ground_truth_size: entries of the environment's ground truth. Raises
     ValueError for an observation that does not suit the arguments.
@@ -890,8 +883,7 @@ class Agent(nn.Module):
         """
         x, hidden = self.memory.step(state, self.encoder(obs))
         self.memory.advance(state, hidden)
-        logits, values, _ = self.heads(x)
-        policy = self.heads.distributions(logits)
+        policy, values, _ = self.heads(x)
         actions = torch.stack([branch.sample() for branch in policy], -1)
         return actions, log_probs_of(policy, actions), values
 
@@ -908,8 +900,7 @@ class Agent(nn.Module):
         x: the steps' encoded observations (B, I). Returns the policy, a distribution of B actions for each branch, the
         log-probabilities (B, A) of the actions (B, A), values (B,) and features (B, F).
         """
-        logits, values, features = self.heads(self.memory.unroll(state, x, pieces))
-        policy = self.heads.distributions(logits)
+        policy, values, features = self.heads(self.memory.unroll(state, x, pieces))
         return policy, log_probs_of(policy, actions), values, features
 
 
@@ -921,12 +912,11 @@ def make_optimizers(agent: Agent, args: Args) -> list[torch.optim.Optimizer]:
     """
     if args.optimizer == "adamw":
         return [torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)]
-    outer = ("encoder.mlp.", "heads.policy.2.", "heads.value.2.", "decoder.", "estimator.")
-    linear = {layer.weight for layer in agent.modules() if isinstance(layer, nn.Linear)}
-    named = agent.named_parameters()
-    hidden = dict.fromkeys(weight for name, weight in named if weight in linear and not name.startswith(outer))
-    others = [weight for weight in agent.parameters() if weight not in hidden]
-    muon = torch.optim.Muon([*hidden], weight_decay=0.01, adjust_lr_fn="match_rms_adamw")
+    outer = ("encoder.mlp", "heads.policy.2", "heads.value.2", "decoder", "estimator")
+    linear = {name: layer.weight for name, layer in agent.named_modules() if isinstance(layer, nn.Linear)}
+    hidden = [weight for name, weight in linear.items() if not name.startswith(outer)]
+    others = [weight for weight in agent.parameters() if weight not in {*hidden}]
+    muon = torch.optim.Muon(hidden, weight_decay=0.01, adjust_lr_fn="match_rms_adamw")
     return [torch.optim.AdamW(others, lr=args.init_lr, fused=True), muon]
 
 
@@ -937,7 +927,7 @@ def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
 
 # ---- 6 MAIN ----
 def setup(args: Args) -> Run:
-    """Check the arguments and make all that a training needs, its files last, so that bad input raises before.
+    """Check the arguments and make all that a training needs; bad input raises before any file is written.
 
     Raises ValueError, OSError, ImportError, RunError or gymnasium.error.Error, each with one line for the user.
     """

@@ -46,7 +46,7 @@ from torch.distributions import Categorical
 from torch.nn.utils.rnn import pad_sequence
 
 from ppo_utils.checkpoints import make_agent
-from ppo_utils.environments import as_tensors, final_numbers, final_observations, ground_truth_of, training_envs
+from ppo_utils.environments import add_ended, as_tensors, final_observations, ground_truth_of, training_envs
 from ppo_utils.fast import encode, first_occurrences, in_chunks
 from ppo_utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, UnitInterval, bounded
 from ppo_utils.processes import all_gather, average_gradients
@@ -139,7 +139,7 @@ class Args:
     max_grad_norm: PositiveFloat = 0.25
     """largest norm of the gradient, which is scaled down to it"""
     target_kl: PositiveFloat | None = None
-    """stop the update at a minibatch on which the approximate KL divergence from the old policy is larger (above 0)"""
+    """end the update at a minibatch whose approximate KL divergence from the rollout's policy exceeds this (above 0)"""
     optimizer: Literal["adamw", "muon"] = "adamw"
     """muon: Muon for the matrices between hidden layers, AdamW for all other weights"""
     muon_lr_ratio: bounded(float, 0, 1000, above=True) = 3.0
@@ -155,7 +155,7 @@ class Args:
     final_ent_coef: NonNegativeFloat = 1.0e-6
     """weight of the exploration bonus from --anneal-steps on"""
     anneal_steps: NonNegativeInt = 163_840_000
-    """steps of linear decay, of both; does not follow --total-timesteps (0: both stay at their initial values)"""
+    """steps over which learning rate and bonus weight decay linearly, whatever --total-timesteps is (0: no decay)"""
     reconstruction_coef: NonNegativeFloat = 0.0
     """weight of the loss of reconstructing the observed image (0: off; thesis: 0.1)"""
     reconstruction_detach: bool = False
@@ -174,7 +174,7 @@ class Args:
     eval_interval: NonNegativeInt = 0
     """iterations between evaluations on unseen levels, with another one at the end (0: no evaluations)"""
     eval_levels: PositiveInt = 50
-    """levels of an evaluation, the first after those of the training; each is played three times"""
+    """number of levels of an evaluation, which follow those of the training; each is played three times"""
     eval_max_steps: PositiveInt = 10_000
     """an evaluation cuts episodes off after this many steps"""
 
@@ -294,7 +294,7 @@ class Rollout:
     rewards: Tensor  # (T, N)
     terminated: Tensor  # (T, N) the step ended its episode
     truncated: Tensor  # (T, N) the step ended its episode by a time limit
-    truncation_values: Tensor  # (T, N) value of the final observation, where bootstrapped
+    truncation_values: Tensor  # (T, N) value of the final observation, 0 where not bootstrapped
     ground_truth: Tensor | None  # (T, N, G), if it is estimated
     next_obs: dict[str, np.ndarray]  # each (N, ...)
     next_ground_truth: np.ndarray | None  # (N, G)
@@ -345,8 +345,7 @@ def collect(
 ) -> tuple[Tensor, dict[str, list[float]]]:
     """Act for T steps in all environments; return the value (N,) of the next step, and metrics of the ended episodes.
 
-    An ended episode is reset in the same step, so that next_obs begins the next one. Metrics are lists by name:
-    charts/episodic_return, charts/episodic_length, and episode/* for every number in the environment's final info.
+    An ended episode is reset in the same step, so that next_obs begins the next one. Metrics: see `add_ended`.
     """
     device, state = rollout.values.device, rollout.memory_state
     episodes = defaultdict(list)
@@ -373,11 +372,7 @@ def collect(
             agent.memory.reset(state, torch.as_tensor(done))
             rollout.next_obs = next_obs
             rollout.next_ground_truth = ground_truth_of(infos, args, rollout.next_ground_truth)
-            if done.any():
-                episodes["charts/episodic_return"] += infos["episode"]["r"][done].tolist()
-                episodes["charts/episodic_length"] += infos["episode"]["l"][done].tolist()
-                for name, values in final_numbers(infos, done).items():
-                    episodes[f"episode/{name}"] += values[~np.isnan(values)].tolist()
+            add_ended(episodes, infos, done)
         return agent.get_value(as_tensors(rollout.next_obs, device), state), episodes
 
 
@@ -482,14 +477,14 @@ def mean_logs(step_logs: list[dict[str, Tensor]], rollout: Rollout) -> dict[str,
 
     Raises FloatingPointError if a loss or a gradient was not finite: the weights are unusable then.
     """
-    values = {name: [logs[name] for logs in step_logs if name in logs] for name in step_logs[0]}
-    losses = {name: torch.stack(each).mean().item() for name, each in values.items()}
+    logged = {name: [logs[name] for logs in step_logs if name in logs] for name in step_logs[0]}
+    losses = {name: torch.stack(each).mean().item() for name, each in logged.items()}
     if not (math.isfinite(losses["loss"]) and math.isfinite(losses["grad_norm"])):
         raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr, or smaller rewards")
     # Before the first gradient step, ratios differ from 1 by rounding only, if the update recomputes what acted.
     losses["ratio_error"] = step_logs[0]["ratio_error"].item()
     losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
-    gradient_steps = len(values["grad_norm"])
+    gradient_steps = len(logged["grad_norm"])
     return {f"losses/{name}": value for name, value in losses.items()} | {"charts/gradient_steps": gradient_steps}
 
 
@@ -656,8 +651,8 @@ class Pieces:
         """
         order = torch.randperm(len(self.first))
         first, length = self.first[order], self.length[order]
-        # Of all pieces end to end, count equal parts: a piece goes where its middle lies, twice which is an integer.
-        twice_middle = 2 * length.cumsum(0) - length
+        # Divide all pieces, end to end, into count equal parts: a piece belongs to the part in which its middle lies.
+        twice_middle = 2 * length.cumsum(0) - length  # an integer
         part = twice_middle * count // (2 * length.sum())  # (S,), ascending
         sizes = part.bincount(minlength=count).tolist()
         for mb_first, mb_length in zip(first.split(sizes), length.split(sizes), strict=True):
@@ -670,8 +665,8 @@ class Pieces:
 #   carry, begin_rollout     what one rollout hands to the next; begin a rollout with it
 #   step, advance, reset     compute a step; store it and move on; forget the episodes that ended
 #   cut, unroll              cut a rollout into pieces; compute whole pieces at once in the update
-#   width                    D, the width of its output
-#   input_width, longest_piece, flags    known from the arguments alone; flags have to be those of loaded weights
+#   width, flags             D, the width of its output; the arguments that loaded weights must have been trained with
+#   input_width, longest_piece    from the arguments alone: the width of an embedding, the most steps of a piece
 # begin_rollout, advance and reset change a state in place; all others only read it.
 @dataclass
 class MemoryState:
@@ -692,10 +687,9 @@ class MemoryState:
 class Memory(nn.Module):
     """Transformer-XL as an episodic memory with a sliding window (§5.3), or GTrXL.
 
-    Every step stores the inputs of the K blocks, with --trxl-query-output the last one's output too. A step's query in
-    block k attends to the inputs of block k at up to W steps before it, of the same episode, never to its own. What no
-    query attends to is set to zero before it is read: a mask alone would let a NaN pass (0 * NaN is NaN). Raises
-    ValueError for a width that does not fit, and for flags that would change nothing.
+    A step's query in block k attends to the inputs of block k at up to W steps before it, of the same episode, never to
+    its own. What no query attends to is set to zero before it is read: a mask alone would let a NaN pass (0 * NaN is
+    NaN). Raises ValueError for a width that does not fit, and for flags that would change nothing.
     """
 
     flags = ("trxl_num_layers", "trxl_num_heads", "trxl_dim", "trxl_memory_length", "trxl_positional_encoding")
@@ -759,12 +753,10 @@ class Memory(nn.Module):
         state.row_step[: self.window] = carry["row_step"]
         state.hidden[: self.window] = carry["hidden"]
         rows, _, mask = self.attended_rows(state)
-        hidden = state.hidden[rows].masked_fill(~mask[:, 0].T[..., None, None], 0.0)  # (M, N, R, D)
-        position = self.position(state.row_step[rows].to(hidden.device), hidden.dtype)  # (M, N, D)
+        hidden = state.hidden[rows].transpose(0, 1).masked_fill(~mask[:, 0, :, None, None], 0.0)  # (N, M, R, D)
+        position = self.position(state.row_step[rows].T.to(hidden.device), hidden.dtype)  # (N, M, D)
         for k, block in enumerate(self.blocks):
-            keys, values = block.keys_values(hidden[:, :, k] + position)
-            state.keys[k, :, rows] = keys.transpose(0, 1)  # (N, M, D)
-            state.values[k, :, rows] = values.transpose(0, 1)
+            state.keys[k, :, rows], state.values[k, :, rows] = block.keys_values(hidden[:, :, k] + position)
 
     def step(self, state: MemoryState, x: Tensor) -> tuple[Tensor, Tensor]:
         """Compute one step of all environments, x (N, D): the output (N, D) and what is stored of it (N, R, D)."""
@@ -774,7 +766,7 @@ class Memory(nn.Module):
         hidden = [x]
         for k, block in enumerate(self.blocks):
             # After the first block, the query is the block's input.
-            x = query = block(x, query, (state.keys[k][:, rows], state.values[k][:, rows]), age, mask)
+            x = query = block(x, query, (state.keys[k, :, rows], state.values[k, :, rows]), age, mask)
             hidden.append(x)
         return x[:, 0], torch.cat(hidden[: self.stored], 1)
 
@@ -787,15 +779,15 @@ class Memory(nn.Module):
         state.row_step[state.now] = state.episode_step
         position = self.position(state.episode_step.to(hidden.device), hidden.dtype)  # (N, D)
         for k, block in enumerate(self.blocks):
-            state.keys[k][:, state.now], state.values[k][:, state.now] = block.keys_values(hidden[:, k] + position)
+            state.keys[k, :, state.now], state.values[k, :, state.now] = block.keys_values(hidden[:, k] + position)
         state.episode_step = state.episode_step + 1
         state.now += 1
 
     def reset(self, state: MemoryState, done: Tensor) -> None:
         """Forget the episodes that ended: done (N,), on the CPU."""
-        rows, ended = self.attended_rows(state)[0], done.nonzero()[:, 0].to(state.keys.device)
+        ended = done.nonzero()[:, 0].to(state.keys.device)
         for cache in (state.keys, state.values):
-            cache[:, ended, rows] = 0.0  # (K, ended, rows, D)
+            cache[:, ended, state.now - self.window : state.now] = 0.0  # (K, ended, W, D)
         state.episode_step = state.episode_step.masked_fill(done, 0)
 
     def cut(self, done: Tensor) -> Pieces:
@@ -827,7 +819,7 @@ class Memory(nn.Module):
         columns = pieces.columns()  # (L,)
         query_rows = (row + columns).clamp(max=last_row)  # (S, L)
         query_step = state.row_step[query_rows, env].where(pieces.is_real(), 0)  # (S, L); padding attends to nothing
-        # A query in column c is at most c steps further in that episode, and attends no further back than the first.
+        # Later columns need no more: c steps further into the same episode, column c attends as far back as column 0.
         length = min(max(int(query_step[:, 0].max()), 1), self.window)
         key_columns = torch.arange(-length, len(columns) - 1)  # (M,)
         key_rows = (row + key_columns).clamp(max=last_row)  # (S, M)
@@ -865,7 +857,7 @@ class Memory(nn.Module):
         return self.encode_step(episode_step, dtype) if self.encoding in ("absolute", "learned") else 0.0
 
     def first_query(self, x: Tensor, episode_step: Tensor, previous_output: Tensor) -> Tensor:
-        """Return x (S, L, D), and added to it the encoding of episode_step (S, L) and the previous output (§7.1.3)."""
+        """Return x (S, L, D) plus, by flag, its step's encoding and previous_output (S, L, D), projected (§7.1.3)."""
         query = x + self.encode_step(episode_step, x.dtype) if self.query_position else x
         if self.query_output is not None:
             query = query + self.query_output(previous_output.masked_fill(episode_step[..., None] == 0, 0.0))
@@ -908,7 +900,7 @@ class Block(nn.Module):
         return self.attention.key(hidden), self.attention.value(hidden)
 
     def forward(self, x: Tensor, query: Tensor, keys_values: tuple, age: Tensor, mask: Tensor) -> Tensor:
-        """Map x (S, L, D) to the next block's input (S, L, D); query (S, L, D) is x, or in the first block more."""
+        """Map x (S, L, D) to the next block's input; query (S, L, D) is x, but in the first block `first_query`."""
         x = self.merge_attention(x, self.attention(self.norm_query(query), *keys_values, age, mask))
         x = self.after_attention(x)
         x = self.merge_output(x, F.relu(self.projection(self.norm_output(x))))
@@ -943,9 +935,12 @@ class Attention(nn.Module):
         return self.output(y.transpose(1, 2).flatten(2)).masked_fill(empty, 0.0)
 
     def query_and_bias(self, x: Tensor, age: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return queries (S, H, L, D / H), a boolean or additive mask, and which queries have no key (S, L, 1)."""
+        """Return queries (S, H, L, D / H), a mask (S, 1 or H, L, M), and which of them have no key (S, L, 1).
+
+        The mask is boolean, or with relative positions added to the scores.
+        """
         empty = ~mask.any(-1, keepdim=True)
-        mask = (mask | empty)[:, None]  # (S, 1, L, M); a row without any key would make the softmax NaN
+        mask = (mask | empty)[:, None]  # (S, 1, L, M); a plain softmax over no key is NaN
         if not self.relative:
             return self.split(self.query(x)), mask, empty
         content_query = self.split(self.query(x + self.content_bias))
@@ -1034,7 +1029,7 @@ class AtariCNN(nn.Sequential):
 
 
 class Encoder(nn.Module):
-    """Encodes the images and vectors of an observation, and embeds them together in `width` (§5.1), unless None."""
+    """Encodes the images and vectors of an observation, and embeds them together (§5.1); width None: no embedding."""
 
     def __init__(self, spaces: dict[str, gym.spaces.Box], width: int | None):
         super().__init__()
@@ -1071,15 +1066,13 @@ class Heads(nn.Module):
         self.policy = mlp_head(size, sum(nvec), 0.1)
         self.value = mlp_head(size, 1, value_gain)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Map the memory's output (B, D) to the logits of all branches, values (B,) and features (B, F)."""
+    def forward(self, x: Tensor) -> tuple[list[Categorical], Tensor, Tensor]:
+        """Map the memory's output (B, D) to each branch's distribution, values (B,) and features (B, F)."""
         with torch.autocast(x.device.type, enabled=False):  # --amp: bfloat16 is too coarse for values and log-ratios
             features = F.relu(self.trunk(x.float()))
-            return self.policy(features), self.value(features)[:, 0], features
-
-    def distributions(self, logits: Tensor) -> list[Categorical]:
-        """Make the distribution of each branch's action from the logits of all branches."""
-        return [Categorical(logits=part, validate_args=False) for part in logits.split(self.nvec, -1)]
+            logits = self.policy(features).split(self.nvec, -1)  # A parts
+            policy = [Categorical(logits=part, validate_args=False) for part in logits]
+            return policy, self.value(features)[:, 0], features
 
 
 def mlp_head(size: int, outputs: int, gain: float) -> nn.Sequential:
@@ -1115,7 +1108,7 @@ class Decoder(nn.Sequential):
 
 
 class Agent(nn.Module):
-    """Encoder, memory and heads: acts step by step, and evaluates whole pieces of what it did.
+    """Encoder, memory and heads: acts step by step, and recomputes pieces of a rollout with gradient.
 
     nvec: number of actions of each branch. ground_truth_size: entries of the environment's ground truth. Raises
     ValueError for an observation that does not suit the arguments.
@@ -1140,8 +1133,7 @@ class Agent(nn.Module):
         """
         x, hidden = self.memory.step(state, self.encoder(obs))
         self.memory.advance(state, hidden)
-        logits, values, _ = self.heads(x)
-        policy = self.heads.distributions(logits)
+        policy, values, _ = self.heads(x)
         actions = torch.stack([branch.sample() for branch in policy], -1)
         return actions, log_probs_of(policy, actions), values
 
@@ -1158,8 +1150,7 @@ class Agent(nn.Module):
         x: the steps' encoded observations (B, I). Returns the policy, a distribution of B actions for each branch, the
         log-probabilities (B, A) of the actions (B, A), values (B,) and features (B, F).
         """
-        logits, values, features = self.heads(self.memory.unroll(state, x, pieces))
-        policy = self.heads.distributions(logits)
+        policy, values, features = self.heads(self.memory.unroll(state, x, pieces))
         return policy, log_probs_of(policy, actions), values, features
 
 
@@ -1171,12 +1162,11 @@ def make_optimizers(agent: Agent, args: Args) -> list[torch.optim.Optimizer]:
     """
     if args.optimizer == "adamw":
         return [torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)]
-    outer = ("encoder.mlp.", "heads.policy.2.", "heads.value.2.", "decoder.", "estimator.")
-    linear = {layer.weight for layer in agent.modules() if isinstance(layer, nn.Linear)}
-    named = agent.named_parameters()
-    hidden = dict.fromkeys(weight for name, weight in named if weight in linear and not name.startswith(outer))
-    others = [weight for weight in agent.parameters() if weight not in hidden]
-    muon = torch.optim.Muon([*hidden], weight_decay=0.01, adjust_lr_fn="match_rms_adamw")
+    outer = ("encoder.mlp", "heads.policy.2", "heads.value.2", "decoder", "estimator")
+    linear = {name: layer.weight for name, layer in agent.named_modules() if isinstance(layer, nn.Linear)}
+    hidden = [weight for name, weight in linear.items() if not name.startswith(outer)]
+    others = [weight for weight in agent.parameters() if weight not in {*hidden}]
+    muon = torch.optim.Muon(hidden, weight_decay=0.01, adjust_lr_fn="match_rms_adamw")
     return [torch.optim.AdamW(others, lr=args.init_lr, fused=True), muon]
 
 
@@ -1187,7 +1177,7 @@ def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
 
 # ---- 6 MAIN ----
 def setup(args: Args) -> Run:
-    """Check the arguments and make all that a training needs, its files last, so that bad input raises before.
+    """Check the arguments and make all that a training needs; bad input raises before any file is written.
 
     Raises ValueError, OSError, ImportError, RunError or gymnasium.error.Error, each with one line for the user.
     """

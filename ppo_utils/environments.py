@@ -2,7 +2,7 @@
 
 `make_envs` puts the vector wrappers around an environment, in order; `envs_for` calls it with a script's arguments.
 `save_state` and `load_state` copy the state of all of them. What a training counts and logs is read from infos:
-`ground_truth_of`, `final_numbers` and `final_observations` take it from them.
+`ground_truth_of`, `add_ended`, `final_numbers` and `final_observations` take it from them.
 A lane is one of the N environments that step together.
 Shape letters: N lanes, A action branches, G entries of the ground truth.
 """
@@ -14,6 +14,7 @@ import json
 import math
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -391,6 +392,18 @@ def ground_truth_of(infos: dict[str, Any], args: Any, before: np.ndarray | None 
     if truth.ndim != 2 or not np.isfinite(truth).all() or (before is not None and truth.shape != before.shape):
         raise RunError(f"{wanted}: an array of numbers, as many in all environments and always, and finite; use 0")
     return truth
+
+
+def add_ended(episodes: defaultdict[str, list[float]], infos: dict[str, Any], done: np.ndarray) -> None:
+    """Add to lists by name what the episodes report that ended, done (N,): nothing where none did.
+
+    charts/episodic_return, charts/episodic_length, and episode/* for every number in the environment's final info.
+    """
+    if done.any():
+        episodes["charts/episodic_return"] += infos["episode"]["r"][done].tolist()
+        episodes["charts/episodic_length"] += infos["episode"]["l"][done].tolist()
+        for name, values in final_numbers(infos, done).items():
+            episodes[f"episode/{name}"] += values[~np.isnan(values)].tolist()
 
 
 def final_numbers(infos: dict[str, Any], lanes: np.ndarray) -> dict[str, np.ndarray]:

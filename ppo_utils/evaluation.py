@@ -31,8 +31,8 @@ def most_probable(agent: nn.Module, obs: dict[str, Tensor], state: Any) -> Tenso
     """Return each branch's most probable action, (N, A), and move the memory's state on, as `get_action_and_value`."""
     x, hidden = agent.memory.step(state, agent.encoder(obs))
     agent.memory.advance(state, hidden)
-    logits, _, _ = agent.heads(x)
-    return torch.stack([branch.logits.argmax(-1) for branch in agent.heads.distributions(logits)], -1)
+    policy, _, _ = agent.heads(x)
+    return torch.stack([branch.logits.argmax(-1) for branch in policy], -1)
 
 
 @torch.no_grad()

@@ -113,9 +113,10 @@ def test_a_step_is_exported_as_documented(trained, script, changes, monkeypatch)
         with torch.no_grad():
             y, hidden = agent.memory.step(memory, agent.encoder(obs))
             agent.memory.advance(memory, hidden)
-            logits, value, _ = agent.heads(y)
+            policy, value, _ = agent.heads(y)
             found_logits, found_value, *state = step(obs, *state)
-        assert found_logits == pytest.approx(logits, abs=1e-6), t
+        for found_branch, branch in zip(found_logits, policy, strict=True):
+            assert found_branch == pytest.approx(branch.logits, abs=1e-6), t
         assert found_value == pytest.approx(value, abs=1e-6), t
         obs, *_ = envs.step(np.array([[t % 4]]))
         if t == 25:  # a new episode: the state begins as it did
