@@ -30,7 +30,7 @@ import textwrap
 import zlib
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
@@ -50,7 +50,7 @@ from ppo_utils.flags import flag
 from ppo_utils.processes import RunError
 
 try:
-    from matplotlib import color_sequences
+    from matplotlib import color_sequences, rc_context
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
@@ -524,6 +524,7 @@ def add_legend(figure: Figure, tasks: dict[str, Runs], styles: dict[str, dict]) 
     figure.legend(lines, texts, loc="outside lower left", ncols=columns, frameon=False)
 
 
+@rc_context({"text.parse_math": False})  # a name may have a $
 def draw_tasks(
     tasks: dict[str, Runs], out: str, metrics: dict[str, tuple[str, ...]], over: str = "steps"
 ) -> dict[str, dict[str, dict[str, np.ndarray]]]:
@@ -762,6 +763,8 @@ def main(config: Config) -> None:
 
     Raises ValueError, OSError, ImportError, gymnasium.error.Error or RunError, each with one line for the user.
     """
+    paths = {name: tuple(map(str, getattr(config, name))) for name in ("checkpoints", "curves")}  # a Path, from Python
+    config = replace(config, **paths)
     if bool(config.checkpoints) == bool(config.curves):
         raise ValueError("give either checkpoints to play with (runs/*/model.pt), or --curves and run folders (runs/*)")
     check_numbers(config)
@@ -774,8 +777,7 @@ def main(config: Config) -> None:
         raise ValueError(f"--json {config.json} is a folder; give a file to write to")
     report = draw_curves(config) if config.curves else score_checkpoints(config)
     if config.json is not None:
-        with open(config.json, "w") as file:
-            json.dump(report, file, indent=1)
+        Path(config.json).write_text(json.dumps(report, indent=1))
 
 
 if __name__ == "__main__":

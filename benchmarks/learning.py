@@ -46,6 +46,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other pac
 
 import evaluate
 import tables
+from ppo_utils.evaluation import first_unseen
 from ppo_utils.flags import check_args, check_minibatches, flag
 from ppo_utils.runs import parse_args
 from suites import AGENTS, SUITES, TASKS, Task, short
@@ -171,6 +172,13 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
         raise SystemExit(
             f"{agent}: an agent has no task, steps, name, seed or evaluations of its own, and goes on with no other "
             "run; use --tasks, --steps-scale, --seeds and --evaluations"
+        )
+    if not args.save_model:
+        raise SystemExit(f"{agent}: --no-save-model leaves no weights to score")
+    if first_unseen(args) + args.eval_levels > FIRST_TEST_LEVEL:
+        raise SystemExit(
+            f"{agent}: levels below {FIRST_TEST_LEVEL:,} are for training and its evaluations, those from there on for "
+            f"the test; it has {args.num_levels:,} from {args.start_level:,} on, and {args.eval_levels} to evaluate"
         )
     iterations = args.total_timesteps // (args.num_envs * args.num_steps)
     args.eval_interval = max(1, iterations // config.evaluations)

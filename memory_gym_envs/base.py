@@ -259,14 +259,17 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
 
     def get_state(self) -> dict[str, Any]:
         """The lanes' arrays, options, seeds and generators, in plain values that later steps do not change."""
-        return {**super().get_state(), "arrays": plain(vars(self.state))}
+        return {**super().get_state(), "made_with": dict(self.arguments), "arrays": plain(vars(self.state))}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Takes over a copy of what get_state() of an environment with the same arguments returned.
 
-        Raises ValueError for the state of another version of the environment; nothing has changed then.
+        Raises ValueError for any other, or that of another version of the environment; nothing has changed then.
         """
-        state = {"_over": np.zeros(self.num_envs, bool), **state}  # states of earlier versions are without
+        if not isinstance(state, Mapping) or "arrays" not in state:
+            raise ValueError(f"this is no state of {self.variant_id}: {brief(state)}")
+        # States of earlier versions are without these.
+        state = {"_over": np.zeros(self.num_envs, bool), "made_with": self.arguments, **state}
         self._check_state(state)
         arrays, settings = restored(state["arrays"]), [self.complete_options(each) for each in state["settings"]]
         super().set_state({**state, "settings": settings})
@@ -275,7 +278,13 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         self.place_tables()
 
     def _check_state(self, state: dict[str, Any]) -> None:
-        """Raises ValueError if the state has not what every lane needs."""
+        """Raises ValueError if the state is of one made with other arguments, or has not what every lane needs."""
+        theirs = state["made_with"]
+        for name in self.arguments | theirs:
+            if theirs.get(name) != self.arguments.get(name):
+                raise ValueError(
+                    f"the saved state is of one with {name} {theirs.get(name)!r}, not {self.arguments.get(name)!r}"
+                )
         arrays = state["arrays"]
         if arrays.keys() != vars(self.state).keys():
             raise ValueError(f"the saved state is of another version of {self.variant_id}")

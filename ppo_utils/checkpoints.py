@@ -36,6 +36,7 @@ T = TypeVar("T")  # a script's Args
 RENAMED = {"head_size": "trunk_size"}
 RENAMED_WEIGHTS = {".norm_items.": ".norm_memory."}
 CHECKPOINTS_KEPT = 2
+SCRIPT_NAME = r"ppo_\w+"  # of what a file may import
 
 
 # ---- writing ----
@@ -169,7 +170,7 @@ def import_script(saved: dict[str, Any], path: str | Path) -> ModuleType:
     if "" not in sys.path:
         sys.path.append("")  # the current folder, after all others
     try:
-        script = importlib.import_module(name) if re.fullmatch(r"ppo_\w+", name) else None
+        script = importlib.import_module(name) if re.fullmatch(SCRIPT_NAME, name) else None
     except ModuleNotFoundError as error:
         if error.name != name:
             raise

@@ -135,8 +135,8 @@ def make_envs(
     try:
         envs = wrap_envs(envs, first_lane, **wrappers)
         images = [name for name, part in envs.single_observation_space.items() if len(part.shape) == 3]
-        if obs_type == "vector" and images and not memory_gym:
-            print(f"{env_id} has no vectors to show instead of its {', '.join(images)}", file=sys.stderr)
+        if obs_type != "pixels" and images and not memory_gym:
+            print(f"{env_id} has no {obs_type} to show instead of its {', '.join(images)}", file=sys.stderr)
 
         if seed is not None:
             with one_line_errors(f"{env_id} cannot be reset"):
@@ -416,7 +416,7 @@ def final_numbers(infos: dict[str, Any], lanes: np.ndarray) -> dict[str, np.ndar
         for name, value in final_info_of(infos, lane).items():
             number = as_number(value)
             if number is not None:
-                numbers.setdefault(name, np.full(len(lanes), np.nan))[lane] = number
+                numbers.setdefault(str(name), np.full(len(lanes), np.nan))[lane] = number
             elif name != "ground_truth":
                 tell_left_out(name)
     return numbers
@@ -432,7 +432,7 @@ def final_info_of(infos: dict[str, Any], lane: int) -> dict[str, Any]:
     found = {}
     for name, values in final.items():
         reported = final.get(f"_{name}", True)
-        if not name.startswith("_") and (reported if np.ndim(reported) == 0 else reported[lane]):
+        if not str(name).startswith("_") and (reported if np.ndim(reported) == 0 else reported[lane]):
             found[name] = values[lane] if np.ndim(values) else values
     return found
 

@@ -74,7 +74,10 @@ def as_flags(values: dict[str, Any]) -> str:
 
 
 def check_args(args: Any) -> None:
-    """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work."""
+    """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work.
+
+    An integer that is given for a float in Python becomes one, so that logs spell both alike.
+    """
     plain = get_type_hints(type(args))
     for name, kind in get_type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
@@ -82,7 +85,10 @@ def check_args(args: Any) -> None:
         kinds = (str,) if is_choice else get_args(plain[name]) or (plain[name],)  # float | None has two
         # Two checks for what is given in Python; tyro has them for the command line. A file with a Path, or with a
         # number of NumPy's, could not be read again.
-        if type(value) not in kinds and not (type(value) is int and float in kinds):
+        if type(value) is int and float in kinds:
+            value = float(value)
+            setattr(args, name, value)
+        if type(value) not in kinds:
             raise ValueError(f"{flag(name)} is {value!r}; it must be of type {kinds[0].__name__}")
         if is_choice and value not in get_args(kind):
             raise ValueError(f"{flag(name)} is {value!r}; it must be one of {', '.join(get_args(kind))}")

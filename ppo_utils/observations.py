@@ -20,6 +20,7 @@ from ppo_utils.processes import RunError
 from ppo_utils.wrappers import OBSERVATION, one_hot, rows_of
 
 SMALLEST_IMAGE = 36  # pixels along a side; what is smaller becomes a vector
+WIDEST_RANGE = 2**16  # of an image's numbers
 WRITABLE = ("C_CONTIGUOUS", "WRITEABLE")  # wrappers overwrite observations in place
 INFOS = (OWN, "ground_truth", "_ground_truth", "final_obs", "_final_obs", "final_info", "_final_info")
 
@@ -67,8 +68,10 @@ class ObservationParts(VectorWrapper):
         self._steps += 1
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         done = terminated | truncated
-        if not np.isfinite(rewards).all():
-            lane = int(np.flatnonzero(~np.isfinite(rewards))[0])
+        with np.errstate(over="ignore"):
+            finite_rewards = np.isfinite(np.asarray(rewards, np.float32))  # as the training keeps them
+        if not finite_rewards.all():
+            lane = int(np.flatnonzero(~finite_rewards)[0])
             raise self._error(lane, f"the reward is {rewards[lane]}", infos.get("final_info") if done[lane] else infos)
         infos = {name: infos[name] for name in INFOS if name in infos}
         ended = np.flatnonzero(done)
@@ -124,8 +127,10 @@ class Part:
         """Say what becomes of a space that is no Dict or Tuple.
 
         A Box with bounds and two neighbouring axes of at least 36 is an image (H, W, C), with all other axes as
-        channels: uint8 if these are bytes from 0 to 255, else float32, scaled from its bounds to 0 to 1. All else is a
-        vector (V,) float32, as Gymnasium's `flatten` makes it: Box, Discrete and MultiDiscrete (one-hot), MultiBinary.
+        channels: uint8 if these are bytes from 0 to 255, else float32, scaled from its bounds to 0 to 1. Bounds further
+        apart than 16 bits, such as the largest numbers of a type, are none: what is between would be one gray. All else
+        is a vector (V,) float32, as Gymnasium's `flatten` makes it: Box, Discrete and MultiDiscrete (one-hot),
+        MultiBinary.
 
         Raises ValueError for other spaces, and for an image without bounds.
         """
@@ -134,7 +139,7 @@ class Part:
             if axes is None:
                 return cls(path, leaf)
             bounds = float(leaf.low.min()), float(leaf.high.max())
-            if np.isfinite(bounds).all():
+            if bounds[1] - bounds[0] < WIDEST_RANGE:  # NaN and infinity are not
                 return cls(path, leaf, axes, bounds)
             if len(leaf.shape) == 2:  # a matrix
                 return cls(path, leaf)
@@ -142,7 +147,8 @@ class Part:
             return cls(path, leaf)
         raise ValueError(
             f"the observation space {name_of(path)}: {brief(leaf)} is not supported; use images (height, width, "
-            "channels) with bounds, Box, Discrete, MultiDiscrete, MultiBinary, and Tuple or Dict of these"
+            "channels) with bounds at most 65,535 apart, Box, Discrete, MultiDiscrete, MultiBinary, and Tuple or Dict "
+            "of these"
         )
 
     def space(self) -> gym.spaces.Box:
@@ -176,7 +182,8 @@ class Part:
                 return np.require(values, np.uint8, WRITABLE)
             low, high = self.bounds
             within(finite(values), low, high)
-            return np.require((values - low) / ((high - low) or 1.0), np.float32, WRITABLE)
+            scaled = np.subtract(values, low, dtype=np.result_type(values, np.float32)) / ((high - low) or 1.0)
+            return np.require(scaled, np.float32, WRITABLE)
         rows = np.reshape(values, (len(values), -1))
         if isinstance(self.leaf, (gym.spaces.Discrete, gym.spaces.MultiDiscrete)):
             first = np.ravel(self.leaf.start).astype(np.int64)

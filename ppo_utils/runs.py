@@ -34,6 +34,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from ppo_utils.checkpoints import (
+    SCRIPT_NAME,
     check_resumed,
     checkpoints_in,
     load_learner,
@@ -110,6 +111,10 @@ def prepare(args: Any, script: str, longest_piece: int) -> tuple[torch.device, d
     longest_piece: the largest number of steps in a piece; minibatches are made of pieces. Raises ValueError, OSError,
     ImportError or gymnasium.error.Error, each with one line for the user.
     """
+    if not re.fullmatch(SCRIPT_NAME, script):
+        raise ValueError(
+            f"the script {script}.py must be named ppo_NAME.py, in letters, digits and _, to be found again"
+        )
     join_processes()
     checkpoint = None if args.resume is None else read_checkpoint(args.resume)
     if checkpoint is not None:
@@ -363,17 +368,17 @@ def run_to_end(args: Any, run: Run, train: Callable[[Any, Run], None]) -> Path:
 
     With --save-model, what was learned is kept, unless the training diverged, it needed too much memory, a file could
     not be written or another process ended. Raises FloatingPointError and RunError as `train` does, then with the last
-    checkpoint's name.
+    checkpoint's name, and KeyboardInterrupt after what was learned is kept.
     """
-    save_model = args.save_model
+    save_model, interrupt = args.save_model, None
     try:
         with report_out_of_memory(args, run.rollout.values.device, more="num_minibatches"):
             train(args, run)
         if run.writer is not None:
             with report_failed_write(run.folder):
                 run.writer.flush()
-    except KeyboardInterrupt:
-        pass
+    except KeyboardInterrupt as error:
+        interrupt = error
     except (FloatingPointError, RunError) as error:
         save_model = False
         found = checkpoints_in(run.folder)
@@ -388,6 +393,8 @@ def run_to_end(args: Any, run: Run, train: Callable[[Any, Run], None]) -> Path:
             close(run)
     if run.writer is not None:
         print(summary(args, run))
+    if interrupt is not None:
+        raise interrupt
     return run.folder
 
 
@@ -446,4 +453,6 @@ def command(
         run_to_end(args, run, train)
     except (FloatingPointError, RunError) as error:
         fail(error)
+    except KeyboardInterrupt:
+        sys.exit(130)
     sys.exit(128 + run.received_signal if run.received_signal else 0)

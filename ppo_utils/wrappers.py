@@ -42,13 +42,18 @@ class SameStepWrapper(Saved, VectorWrapper):
 
     The observation of a lane whose episode just ended is the wrapped first one of its next episode; `final_obs` holds
     the wrapped last one of the ended episode. `reset_mask` limits a reset to some lanes. Options, rewards, infos and
-    images of render() are the environment's. Raises ValueError for an environment without same-step autoreset.
+    images of render() are the environment's. Raises ValueError for an environment without same-step autoreset, and for
+    observations that are neither arrays nor a Dict of these.
     """
 
     def __init__(self, env: VectorEnv):
         super().__init__(env)
         if env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
             raise ValueError(f"{type(self).__name__} needs an environment with AutoresetMode.SAME_STEP, not {env}")
+        arrays = (gym.spaces.Box, gym.spaces.Discrete, gym.spaces.MultiDiscrete, gym.spaces.MultiBinary)
+        space = env.single_observation_space
+        if not all(isinstance(part, arrays) for part in named(space).values()):
+            raise ValueError(f"{type(self).__name__} needs arrays to observe, or a Dict of them, not {brief(space)}")
 
     # ---- what a wrapper provides: `wrap`, and the other two if it remembers something ----
 
@@ -221,7 +226,7 @@ class VectorStack(SameStepWrapper):
 class StepEncoding(SameStepWrapper):
     """The number of steps since the episode began, as a sinusoidal encoding beside the observation (thesis 6.2.1).
 
-    width: D, even; the thesis has 16. Works with any observation.
+    width: D, even; the thesis has 16. Works with any arrays.
     Observation: Dict of `step_encoding`, Box (D,) float32 of (2.57) and (2.58), and the environment's own parts, or
     `observation` if it is no Dict. Position 0 is the episode's first observation; there is no last one.
 
@@ -255,7 +260,7 @@ class StepEncoding(SameStepWrapper):
 class LastAction(SameStepWrapper):
     """The action and the reward of the step before, beside the observation.
 
-    Works with any observation, and with Discrete and one-dimensional MultiDiscrete actions.
+    Works with any arrays, and with Discrete and one-dimensional MultiDiscrete actions.
     Observation: Dict of `last_action`, Box (V,) float32, and the environment's own parts, or `observation` if it is no
     Dict. The vector is the action one-hot, branch after branch, then the reward; zeros at an episode's beginning.
 

@@ -312,9 +312,22 @@ def test_a_value_of_another_type(tiny, name, value, kind):
         check_args(tiny(**{name: value}))
 
 
-@pytest.mark.parametrize("changes", [{"gamma": 1}, {"target_kl": None}, {"target_kl": 1}])
-def test_an_integer_is_a_float_and_none_is_optional(tiny, changes):
-    check_args(tiny(**changes))
+@pytest.mark.parametrize(
+    ("changes", "found"), [({"gamma": 1}, 1.0), ({"target_kl": None}, None), ({"target_kl": 1}, 1.0)]
+)
+def test_an_integer_becomes_a_float_and_none_is_optional(tiny, changes, found):
+    """Else curves would tell an agent with gamma=1 from one with gamma=1.0, as the command line has it."""
+    args = tiny(**changes)
+    check_args(args)
+    (name,) = changes
+    assert repr(getattr(args, name)) == repr(found)
+
+
+@pytest.mark.parametrize("name", ["my_agent", "ppo_my-net", "ppo_gru.v2", "ppo_"])
+def test_a_script_that_its_files_could_not_name(tiny, name):
+    """Before it trains: its models would be read by nothing."""
+    with pytest.raises(ValueError, match=re.escape(f"the script {name}.py must be named ppo_NAME.py, in letters, ")):
+        runs.prepare(tiny(), name, 8)
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

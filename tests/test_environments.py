@@ -25,6 +25,7 @@ from ppo_utils.environments import (
     make_envs,
     parse_options,
 )
+from ppo_utils.observations import Part
 from ppo_utils.video import LaneVideo, check_can_film
 
 LANES = 3
@@ -241,6 +242,8 @@ def box(low, high, shape, dtype=np.float32):
         box(0, 255, (7, 7, 3), np.uint8),
         box(-np.inf, np.inf, (3,), np.float64),
         box(0, np.inf, (40, 40)),  # a matrix without bounds
+        box(-1e10, 1e10, (40, 50)),  # scaled to 0 to 1, it would all be gray
+        box(0, 2**16, (40, 50), np.int64),
         gym.spaces.Discrete(5, start=2),
         gym.spaces.MultiDiscrete([[2, 3], [4, 1]]),
         gym.spaces.MultiBinary((2, 2)),
@@ -291,6 +294,26 @@ def test_pictures_get_height_width_and_channels(space, shape, dtype, moved):
     infos = next(steps)[-1]
     for lane in range(LANES):
         assert np.array_equal(infos["final_obs"][lane]["observation"], moved(ending[lane][-1]))
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.int32, np.int64])
+def test_the_largest_numbers_of_a_type_are_no_bounds(dtype):
+    largest = np.finfo(dtype).max if np.issubdtype(dtype, np.floating) else np.iinfo(dtype).max
+    assert Part.of((), box(-largest, largest, (40, 50), dtype)).axes is None
+    with pytest.raises(ValueError, match=r"use images .* with bounds at most 65,535 apart"):
+        Part.of((), box(-largest, largest, (40, 50, 3), dtype))
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.uint16, np.int32, np.float64])
+def test_images_of_all_types_are_scaled_from_their_bounds(dtype):
+    """In float16, the difference of the bounds would be infinite."""
+    low, high = (0, 65_535) if dtype == np.uint16 else (-32_000, 33_500)
+    part = Part.of(("observation",), box(low, high, (40, 50), dtype))
+    values = np.full((2, 40, 50), high, dtype)
+    values[0, 0, 0] = low
+    found = part.convert(values)
+    assert found.dtype == np.float32
+    assert (found[0, 0, 0, 0], found[0, 0, 1, 0], found[1].min()) == pytest.approx((0, 1, 1), abs=1e-3)
 
 
 def test_parts_keep_their_names_and_their_order():
@@ -517,6 +540,11 @@ def test_only_numbers_of_the_lanes_that_have_them():
     ((name, values),) = final_numbers({"final_info": final}, lanes).items()
     assert name == "score"
     np.testing.assert_equal(values, [1.0, np.nan, np.nan])
+
+
+def test_names_of_numbers_are_texts():
+    final = {3: np.array([1.0, 2.0]), "_3": np.array([True, True])}
+    assert list(final_numbers({"final_info": final}, np.ones(2, bool))) == ["3"]
 
 
 def test_final_observations_leave_the_others_alone():
@@ -799,4 +827,4 @@ def test_vectors_that_are_not_there_are_told(capfd):
     make_envs("CartPole-v1", 1, obs_type="vector").close()
     assert capfd.readouterr().err == "", "it shows vectors anyway"
     make_envs(needs("ale_py:ALE/Pong-v5"), 1, obs_type="vector").close()
-    assert "ale_py:ALE/Pong-v5 has no vectors to show instead of its observation\n" in capfd.readouterr().err
+    assert "ale_py:ALE/Pong-v5 has no vector to show instead of its observation\n" in capfd.readouterr().err

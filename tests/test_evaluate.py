@@ -311,7 +311,9 @@ def agents(tiny, tmp_path_factory):
 
 
 def test_curves_drawn(agents, scalars, capsys):
-    evaluate.main(evaluate.Config(curves=tuple(agents), metrics=("length", "losses/entropy"), json="ends.json"))
+    evaluate.main(
+        evaluate.Config(curves=tuple(map(Path, agents)), metrics=("length", "losses/entropy"), json="ends.json")
+    )
     assert Image.open("curves.png").size[0] > 1000
     assert xml.etree.ElementTree.parse("curves.svg").getroot().tag.endswith("svg")
     (task,) = json.loads(Path("ends.json").read_text())
@@ -383,7 +385,7 @@ def test_the_levels_of_an_older_run():
 
 def test_a_picture_goes_to_a_folder_that_is_not_there_yet():
     with SummaryWriter("run-1") as writer:
-        writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|1|\n|env_id|A-v0|")
+        writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|1|\n|env_id|A-v0|\n|exp_name|$_$^|")
         writer.add_scalar("eval/return", 1.0, 10)
         writer.add_tensor("eval_levels/return", torch.tensor([[1.0, 2.0]]), 10)
     evaluate.draw_curves(evaluate.Config(curves=("run-1",), out="new/curves"))
@@ -592,7 +594,7 @@ def test_scores_are_those_of_the_levels(agents, capsys):
 
 def scores_of(agents, metric="num_fails", **changes):
     """A metric (M, E) of an agent's episodes, and the title of what it played."""
-    evaluate.main(evaluate.Config((f"{agents[0]}/model.pt",), json="scores.json", **{**FEW, **changes}))
+    evaluate.main(evaluate.Config((Path(agents[0]) / "model.pt",), json=Path("scores.json"), **{**FEW, **changes}))
     (task,) = json.loads(Path("scores.json").read_text())
     return np.array(task["agents"][0]["metrics"][metric]["scores"][0]), task["task"]
 

@@ -91,6 +91,9 @@ def test_an_agent_has_no_task_of_its_own(flags):
 @pytest.mark.parametrize(
     ("agent", "seed", "message"),
     [
+        ("GRU --no-save-model", 1, "GRU --no-save-model: --no-save-model leaves no weights to score"),
+        ("GRU --start-level 950000", 1, "levels below 1,000,000 are for .*; it has 100,000 from 950,000 on, and 50 "),
+        ("GRU --num-levels 1000000", 1, "levels below 1,000,000 are for .*; it has 1,000,000 from 0 on, and 50 "),
         ("GRU --num-envs 0", 1, "GRU --num-envs 0: --num-envs is 0; it must be 1 or more"),
         ("GRU", -1, "GRU: --seed is -1; it must be 0 or more"),
         ("GRU --num-minibatches 99999", 1, "GRU --num-minibatches 99999: .* an iteration may have only 32 sequences"),

@@ -255,9 +255,9 @@ def test_a_wrong_observation_is_one_line(space, wrong, message, last):
 
 
 @EACH_SCRIPT
-@pytest.mark.parametrize("what", ["observation", "reward"])
-def test_a_training_stops_before_what_is_not_finite(tiny, script, what):
-    """The line names the level, and the last good checkpoint; the learning rate has nothing to do with it."""
+@pytest.mark.parametrize(("what", "earned"), [("observation", 1.0), ("reward", np.inf), ("reward", 1e39)])
+def test_a_training_stops_before_what_is_not_finite(tiny, script, what, earned):
+    """In float32, as 1e39 is not. The line names the level and the last checkpoint, not the learning rate."""
     levels = []
 
     def bad(env, now):
@@ -267,11 +267,12 @@ def test_a_training_stops_before_what_is_not_finite(tiny, script, what):
         return True
 
     see = lambda env: np.array([np.nan if bad(env, "observation") else 0.0], np.float32)  # noqa: E731
-    earn = lambda env: np.inf if bad(env, "reward") else 1.0  # noqa: E731
-    args = tiny(script, env_id=small(count=itertools.count(), see=see, earn=earn), checkpoint_interval=1)
+    earn = lambda env: earned if bad(env, "reward") else 1.0  # noqa: E731
+    env_id = small(count=itertools.count(), see=see, earn=earn)
+    args = tiny(script, env_id=env_id, checkpoint_interval=1, observe_last_action=True)
     with pytest.raises(RunError) as error:
         script.main(args)
-    says = "observation has an entry nan" if what == "observation" else "the reward is inf"
+    says = "observation has an entry nan" if what == "observation" else f"the reward is {earned}"
     where = f"environment 2, step 1 since its reset with seed {levels[0]}"
     assert f"iteration 2: {args.env_id}: {says} ({where})" in str(error.value)
     assert 0 <= levels[0] < args.num_levels

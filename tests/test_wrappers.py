@@ -161,6 +161,19 @@ def test_needs_same_step_autoreset(wrapper):
         wrapper(SyncVectorEnv([lambda: gym.make("MysteryPath-v0")]))
 
 
+@pytest.mark.parametrize("part", [gym.spaces.Text(9), gym.spaces.Dict({"x": gym.spaces.Discrete(3)})])
+@pytest.mark.parametrize("wrapper", [LastAction, StepEncoding])
+def test_needs_arrays(wrapper, part):
+    """At an episode's end, others could not be put together."""
+    for space in (gym.spaces.Tuple([part]), gym.spaces.Dict({"inside": part})):
+
+        class Odd(gym.Env):
+            observation_space, action_space = space, gym.spaces.Discrete(2)
+
+        with pytest.raises(ValueError, match=f"{wrapper.__name__} needs arrays to observe, or a Dict of them, not "):
+            wrapper(sync(Odd))
+
+
 @pytest.mark.parametrize("wrapper", [GrayscaleStack, SpotlightPerturbation])
 def test_needs_a_picture(wrapper):
     with pytest.raises(ValueError, match=f"{wrapper.__name__} needs one .* image"):

@@ -128,6 +128,34 @@ def test_the_state_of_another_environment(other, message):
     check_refused(env, theirs.get_state(), message)
 
 
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"id": "MysteryPath-Grid-v0"},
+        {"num_envs": 2},
+        {"obs_type": "vector"},
+        {"num_levels": 4},
+        {"start_level": 4},
+        {"max_episode_steps": 20},
+        {"autoreset_mode": "NextStep"},
+    ],
+)
+def test_the_state_of_another_vector_environment(other):
+    """Ids of a family have arrays of the same shapes."""
+    arguments = {"id": "MysteryPath-v0", "num_envs": 3}
+    envs, theirs = (gym.make_vec(**arguments | changes) for changes in ({}, other))
+    for each in (envs, theirs):
+        each.reset(seed=0)
+    before = pickle.dumps(envs.get_state())
+    ((name, value),) = other.items()
+    with pytest.raises(ValueError, match=f"the saved state is of one with {name} {value!r}, not "):
+        envs.set_state(theirs.get_state())
+    for state in ({}, None):
+        with pytest.raises(ValueError, match=f"this is no state of MysteryPath-v0: {state}"):
+            envs.set_state(state)
+    assert pickle.dumps(envs.get_state()) == before
+
+
 def test_what_is_no_state():
     env = gym.make("MysteryPath-v0").unwrapped
     env.reset(seed=0)
