@@ -152,7 +152,7 @@ LAPTOP = {
         "MortarMayhemB-Grid-v0": 6,
         "Endless-MortarMayhem-v0": 3,
         "Endless-MysteryPath-v0": 3,
-        "SearingSpotlights-v0": 3,
+        "SearingSpotlights-v0": 6,
         "Endless-SearingSpotlights-v0": 3,
     }.items()
 }
