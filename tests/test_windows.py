@@ -344,14 +344,33 @@ def test_what_is_not_seen_changes_nothing(encoding, fill, flag):
 
 
 def test_a_forgotten_episode_leaves_nothing_in_the_cache():
+    """The other episode goes on, so that all of the forgotten one is still within the window."""
     memory = make_memory()
-    state = fresh(memory, 2)
+    state, x = fresh(memory, 2), torch.randn(2, WIDTH).double()
     with torch.no_grad():
         for _ in range(4):
-            take_step(memory, state, torch.full((2, WIDTH), math.nan).double())
-        memory.reset(state, torch.tensor([True, True]))
+            take_step(memory, state, torch.stack([torch.full_like(x[0], math.nan), x[1]]))
+        memory.reset(state, torch.tensor([True, False]))
         for _ in range(7):
-            assert take_step(memory, state, torch.randn(2, WIDTH).double()).isfinite().all()
+            assert take_step(memory, state, x).isfinite().all()
+
+
+@pytest.mark.parametrize("query_output", [False, True])
+def test_a_step_stores_the_inputs_of_its_blocks(query_output):
+    """And what the last one returns, for --trxl-query-output only."""
+    memory, inputs = make_memory(trxl_query_output=query_output), []
+    for block in memory.blocks:
+        block.register_forward_pre_hook(lambda _, given: inputs.append(given[0]))
+    state, x = fresh(memory), torch.randn(LANES, WIDTH).double()
+    for _ in range(3):
+        inputs.clear()
+        with torch.no_grad():
+            y, hidden = memory.step(state, x)
+        wanted = [*inputs, y[:, None]] if query_output else inputs
+        assert hidden.equal(torch.cat(wanted, 1))
+        memory.advance(state, hidden)
+        assert state.hidden[state.now - 1].equal(hidden)
+        x = y
 
 
 def test_a_step_that_is_not_stored_changes_nothing():
