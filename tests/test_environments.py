@@ -307,7 +307,7 @@ def test_the_largest_numbers_of_a_type_are_no_bounds(dtype):
 @pytest.mark.parametrize("dtype", [np.float16, np.uint16, np.int32, np.float64])
 def test_images_of_all_types_are_scaled_from_their_bounds(dtype):
     """In float16, the difference of the bounds would be infinite."""
-    low, high = (0, 65_535) if dtype == np.uint16 else (-32_000, 33_500)
+    low, high = (0, 65_535) if dtype == np.uint16 else (-32_016, 33_504)
     part = Part.of(("observation",), box(low, high, (40, 50), dtype))
     values = np.full((2, 40, 50), high, dtype)
     values[0, 0, 0] = low
