@@ -886,13 +886,13 @@ class Block(nn.Module):
         super().__init__()
         width = args.trxl_dim
         before, after = (nn.LayerNorm, nn.Identity) if args.trxl_layer_norm == "pre" else (nn.Identity, nn.LayerNorm)
-        self.norm_query, self.norm_memory, self.norm_output = before(width), before(width), before(width)
+        self.norm_query, self.norm_memory, self.norm_projection = before(width), before(width), before(width)
         self.after_attention, self.after_projection = after(width), after(width)
         self.attention = Attention(width, args.trxl_num_heads, args.trxl_positional_encoding == "relative")
         self.projection = nn.Linear(width, width)
         gated = args.trxl_gate == "gru"  # else, residual connections
         self.merge_attention = Gate(width, args.trxl_gate_bias) if gated else torch.add
-        self.merge_output = Gate(width, args.trxl_gate_bias) if gated else torch.add
+        self.merge_projection = Gate(width, args.trxl_gate_bias) if gated else torch.add
 
     def keys_values(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
         """Project hidden states (..., D), to which their positions are added already, to keys and values."""
@@ -903,7 +903,7 @@ class Block(nn.Module):
         """Map x (S, L, D) to the next block's input; query (S, L, D) is x, but in the first block `first_query`."""
         x = self.merge_attention(x, self.attention(self.norm_query(query), *keys_values, age, mask))
         x = self.after_attention(x)
-        x = self.merge_output(x, F.relu(self.projection(self.norm_output(x))))
+        x = self.merge_projection(x, F.relu(self.projection(self.norm_projection(x))))
         return self.after_projection(x)
 
 

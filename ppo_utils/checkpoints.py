@@ -34,7 +34,11 @@ if TYPE_CHECKING:
 T = TypeVar("T")  # a script's Args
 # Names that flags and weights have in older files.
 RENAMED = {"head_size": "trunk_size"}
-RENAMED_WEIGHTS = {".norm_items.": ".norm_memory."}
+RENAMED_WEIGHTS = {
+    ".norm_items.": ".norm_memory.",
+    ".norm_output.": ".norm_projection.",
+    ".merge_output.": ".merge_projection.",
+}
 CHECKPOINTS_KEPT = 2
 SCRIPT_NAME = r"ppo_\w+"  # of what a file may import
 

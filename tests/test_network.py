@@ -101,9 +101,8 @@ def test_muon_has_the_matrices_between_hidden_layers(tiny, opened, script):
     common = {"encoder.embedding.weight", "heads.trunk.weight", "heads.policy.0.weight", "heads.value.0.weight"}
     blocks = [f"memory.blocks.{k}." for k in range(2)] if script is ppo_trxl else []
     inside = [f"attention.{each}" for each in ("query", "key", "value", "output")] + ["projection"]
-    inside += [
-        f"{gate}.{each}" for gate in ("merge_attention", "merge_output") for each in ("from_y", "from_x", "candidate")
-    ]
+    gates = ("merge_attention", "merge_projection")
+    inside += [f"{gate}.{each}" for gate in gates for each in ("from_y", "from_x", "candidate")]
     assert {names[weight] for weight in group["params"]} == common | {f"{b}{i}.weight" for b in blocks for i in inside}
     assert (group["weight_decay"], group["momentum"], group["adjust_lr_fn"]) == (0.01, 0.95, "match_rms_adamw")
     assert (group["nesterov"], group["ns_steps"]) == (True, 5)
@@ -211,7 +210,7 @@ def test_every_matrix_of_a_gate_is_initialized_alike(scheme):
     block = ppo_trxl.Block(ppo_trxl.Args(trxl_dim=128, trxl_gate="gru"))
     ppo_trxl.block_init(block, scheme, 3)
     want = block.attention.query.weight.std().item()
-    for gate in (block.merge_attention, block.merge_output):
+    for gate in (block.merge_attention, block.merge_projection):
         matrices = torch.cat([gate.from_y.weight, gate.from_x.weight, gate.candidate.weight]).split(128)
         assert len(matrices) == 6
         assert [matrix.std().item() for matrix in matrices] == pytest.approx([want] * 6, rel=0.05)

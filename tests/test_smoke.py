@@ -142,14 +142,19 @@ def test_flags_that_were_renamed(tiny):
 
 
 def test_weights_that_were_renamed(tiny):
-    args = tiny(ppo_trxl, env_id="CueRecall-v0", total_timesteps=64, save_model=True)
+    args = tiny(ppo_trxl, env_id="CueRecall-v0", total_timesteps=64, save_model=True, trxl_gate="gru")
     path = ppo_trxl.main(args) / "model.pt"
     saved = torch.load(path, weights_only=True)
-    weights = saved["weights"]
-    saved["weights"] = {name.replace(".norm_memory.", ".norm_items."): weight for name, weight in weights.items()}
-    assert saved["weights"].keys() != weights.keys()
-    torch.save(saved, path)
-    assert list(read_model(path)["weights"]) == list(weights)
+    written = names = list(saved["weights"])
+    for now, before in (
+        (".norm_memory.", ".norm_items."),
+        (".norm_projection.", ".norm_output."),
+        (".merge_projection.", ".merge_output."),
+    ):
+        assert any(now in name for name in names)
+        names = [name.replace(now, before) for name in names]
+    torch.save(saved | {"weights": dict(zip(names, saved["weights"].values(), strict=True))}, path)
+    assert list(read_model(path)["weights"]) == written
 
 
 def test_logs_every_number_of_the_final_info(tiny, scalars):

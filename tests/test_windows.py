@@ -126,8 +126,8 @@ def naive(memory, x, row, lane, stored, own=None):
         if window:
             attended = attention.output.weight @ torch.cat(heads) + attention.output.bias
         x = normed(block.after_attention, merged(block.merge_attention, x, attended))
-        projected = F.relu(block.projection.weight @ normed(block.norm_output, x) + block.projection.bias)
-        x = normed(block.after_projection, merged(block.merge_output, x, projected))
+        projected = F.relu(block.projection.weight @ normed(block.norm_projection, x) + block.projection.bias)
+        x = normed(block.after_projection, merged(block.merge_projection, x, projected))
     if own is not None:
         own.append(inputs)
     return x
