@@ -20,7 +20,7 @@ MEMORIES = {
 }
 # The thesis' exploration bonus, with the weights that suit it on these tasks; the preset has the log barrier.
 ENTROPY = "--exploration-bonus entropy --init-ent-coef 1e-3 --final-ent-coef 1e-4"
-MUON = {  # today's --preset laptop
+MUON = {  # --preset laptop
     "no memory, Muon": "ppo_gru.py --memory none",
     "stack of 16, Muon": "ppo_gru.py --memory none --frame-stack 16",
     "GRU, Muon": "ppo_gru.py",
@@ -143,7 +143,7 @@ FULL = {  # trained for what two cores can do in a day, all agents and seeds tog
         "Endless-SearingSpotlights-v0": 3,
     }.items()
 }
-# With today's preset: until an agent comes to rest, or as far as is affordable.
+# With --preset laptop: until an agent comes to rest, or as far as is affordable.
 LAPTOP = {
     env_id: replace(FULL[env_id], total_timesteps=int(1_000_000 * millions))
     for env_id, millions in {

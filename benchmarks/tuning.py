@@ -1,4 +1,4 @@
-"""How many steps and minutes today's preset takes, beside the one before: the table of docs/tuning.md.
+"""How many steps `--preset laptop` takes, and how fast it is, beside the one before: the table of docs/tuning.md.
 
     python benchmarks/tuning.py
 
@@ -58,7 +58,7 @@ def read_speeds() -> dict[tuple[str, str, str], float]:
 def measure_speeds(tasks: tuple[str, ...]) -> None:
     """Train for a few iterations with each script and preset in turn, on one core, and write their steps per second.
 
-    Raises SystemExit for tasks that today's preset was not trained on.
+    Raises SystemExit for tasks that this preset was not trained on.
     """
     if unknown := {*tasks} - {*LAPTOP}:
         raise SystemExit(f"there is no {min(unknown)!r}; there are {'; '.join(LAPTOP)}")
@@ -85,13 +85,13 @@ def steps_to(goal: float, steps: np.ndarray, scores: np.ndarray) -> str:
 
 
 def table(speeds: dict[tuple[str, str, str], float]) -> str:
-    """Return a row for each task and script: score, steps to 0.5 and 0.9 of the best, minutes, and what AdamW had.
+    """Return a row for each task and script: score, steps to 0.5 and 0.9 of the best, speed, and what AdamW had.
 
-    The best is the best possible score, or where there is no bound the highest mean of these agents. Minutes are those
-    of all steps at the measured steps per second. Raises SystemExit where an agent has no results.
+    The best is the best possible score, or where there is no bound the highest mean of these agents. Raises SystemExit
+    where an agent has no results.
     """
-    lines = ["| task | script | steps | score | steps to 0.5 | to 0.9 | steps/s | minutes | AdamW: to 0.5 | steps/s |"]
-    lines.append("|---|---|---:|---:|---:|---:|---:|---:|---:|---:|")
+    lines = ["| task | script | steps | score | steps to 0.5 | to 0.9 | steps/s | AdamW: to 0.5 | steps/s |"]
+    lines.append("|---|---|---:|---:|---:|---:|---:|---:|---:|")
     for name in dict.fromkeys(task for task, _, _ in speeds):
         runs_of = {
             key: learning.results_of(learning.Config(results=RESULTS), plans_of(name, *agent))[name].popitem()[1]
@@ -110,7 +110,7 @@ def table(speeds: dict[tuple[str, str, str], float]) -> str:
             total = int(runs_of[script, "Muon"][0].args["total_timesteps"])
             cells = [name, f"`{script}`", f"{total / 1e6:g} M", tables.mean_and_error(muon[1][-1])]
             cells += [steps_to(0.5 * best, *muon), steps_to(0.9 * best, *muon), f"{fast:,.0f}"]
-            cells += [f"{total / fast / 60:.1f}", steps_to(0.5 * best, *adamw), f"{slow:,.0f}"]
+            cells += [steps_to(0.5 * best, *adamw), f"{slow:,.0f}"]
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
