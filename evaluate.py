@@ -357,7 +357,7 @@ def read_run(path: str) -> RunLog:
 def event_curves(events: EventAccumulator) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return the curves in a run's TensorBoard files. There is no point where a scalar is not a finite number.
 
-    Of steps that a resumed run played twice, the last count.
+    Of steps that a resumed run played twice, the last count, and those that it has not played again do not.
     """
     points = {}  # by name, values (M, E) by step
     for name in events.Tags()["scalars"]:
@@ -365,9 +365,11 @@ def event_curves(events: EventAccumulator) -> dict[str, tuple[np.ndarray, np.nda
         points[name] = {step: value for step, value in found.items() if np.isfinite(value)}
     for name in events.Tags()["tensors"]:
         if name.startswith("eval_levels/"):
+            means = name.replace("eval_levels/", "eval/")
             found = {point.step: make_ndarray(point.tensor_proto) for point in events.Tensors(name)}
-            points[name.replace("eval_levels/", "eval/")] = {
-                step: scores.reshape(len(scores), -1) for step, scores in found.items()
+            # The reader forgets what lies beyond the step of --resume, but of scalars only.
+            points[means] = {
+                step: scores.reshape(len(scores), -1) for step, scores in found.items() if step in points.get(means, ())
             }
     return {name: (np.array([*each]), stack_scores([*each.values()])) for name, each in points.items() if each}
 

@@ -25,6 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from ppo_utils.environments import ground_truth_of, load_state, save_state
+from ppo_utils.evaluation import first_unseen
 from ppo_utils.flags import as_flags, flag
 from ppo_utils.processes import all_gather, rank_and_size
 
@@ -239,7 +240,7 @@ def check_resumed(args: Any, saved: dict[str, Any], script: str) -> None:
 
 
 def load_model(args: Any, agent: nn.Module, script: str) -> None:
-    """Give the agent the weights of --load-model.
+    """Give the agent the weights of --load-model; say so if they were trained on levels that this run is evaluated on.
 
     Raises ValueError if another script, or one with other flags of the network, trained them; OSError without a file.
     """
@@ -254,6 +255,14 @@ def load_model(args: Any, agent: nn.Module, script: str) -> None:
         ours, theirs = (as_flags({name: getattr(each, name) for name in differ}) for each in (args, theirs))
         raise ValueError(f"{path} was trained with {theirs}, not with {ours}")
     load_weights(agent, saved, path)
+    first, beyond = first_unseen(args), first_unseen(theirs)
+    met = theirs.num_levels and first < beyond and first + args.eval_levels > theirs.start_level
+    if met and theirs.env_id == args.env_id and rank_and_size()[0] == 0:
+        print(
+            f"{path} was trained on levels {theirs.start_level} to {beyond - 1}, and this run is evaluated on levels "
+            f"{first} to {first + args.eval_levels - 1}; --start-level {beyond} makes them unseen ones",
+            file=sys.stderr,
+        )
 
 
 def load_learner(run: Run, saved: dict[str, Any], folder: str | Path) -> None:

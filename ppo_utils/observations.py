@@ -66,7 +66,8 @@ class ObservationParts(VectorWrapper):
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], Any, Any, Any, dict[str, Any]]:
         """Step every lane, its observations in parts, those in `final_obs` too."""
         self._steps += 1
-        observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        observations, rewards, *ends, infos = self.env.step(actions)
+        terminated, truncated = (np.asarray(each, bool) for each in ends)
         done = terminated | truncated
         with np.errstate(over="ignore"):
             finite_rewards = np.isfinite(np.asarray(rewards, np.float32))  # as the training keeps them

@@ -474,6 +474,24 @@ def test_a_resumed_run_counts_its_seconds_once(caplog):
     assert not caplog.records, "TensorBoard calls it a crash"
 
 
+def test_a_resumed_run_forgets_the_evaluations_beyond_its_checkpoint():
+    """It evaluated in iterations 2 and 4, crashed, and has played none of what follows iteration 2 again."""
+    write_events("a", 1, [(1, 1)] * 4)
+    (first,) = Path("a").iterdir()
+    first.rename("a/events.out.tfevents.0")
+    with SummaryWriter("b") as writer:
+        for step in (200, 400):
+            writer.add_scalar("eval/return", step, step)
+            writer.add_tensor("eval_levels/return", torch.full((2, 3), step / 1.0), step)
+    (second,) = Path("b").iterdir()
+    second.rename("a/events.out.tfevents.1")
+    write_events("a", 1, [], purge_step=201)
+    run = evaluate.read_run("a")
+    steps, scores = run.curves["eval/return"]
+    assert (steps.tolist(), scores.tolist()) == ([200], [[[200.0] * 3] * 2])
+    assert run.last_step == 200
+
+
 def test_curves_over_time_are_aligned_in_hours():
     fast = evaluate.read_run(write_events("a", 1, [(1800, 1800)] * 3))  # 1, 2 and 3 hours
     slow = evaluate.read_run(write_events("b", 2, [(3600, 3600)] * 3))  # 2, 4 and 6 hours

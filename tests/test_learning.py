@@ -226,18 +226,23 @@ def test_a_training_that_is_about_to_begin_is_stopped_too(tmp_path, monkeypatch)
     ("total", "last", "complete"), [(96, 64, False), (96, 96, True), (100, 64, False), (100, 96, True)]
 )
 def test_a_run_is_complete_when_no_iteration_is_left(total, last, complete, tmp_path):
-    """Of 32 steps each; and when it has written its final weights."""
+    """Of 32 steps each; and when it has written its final weights: it may have been stopped, resumed and killed."""
     seconds = {name: (np.array([last]), np.ones((1, 1, 1))) for name in evaluate.SECONDS.values()}
     args = {"total_timesteps": str(total), "num_envs": "4", "num_steps": "8"}
     run = evaluate.RunLog(str(tmp_path), args, seconds)
     assert not learning.is_complete(run)
-    (tmp_path / "model.pt").touch()
+    write_model(tmp_path, last - 32)
+    assert not learning.is_complete(run)
+    write_model(tmp_path, last)
     assert learning.is_complete(run) == complete
 
 
-def test_weights_of_an_earlier_step_are_not_scored(tmp_path, monkeypatch):
-    """A run was stopped, which wrote them, went on, and was killed before it wrote its last ones."""
-    agent = {"steps": [64], "metrics": {"return": {"scores": [[[1.0]]]}}}
+def write_model(folder, step):
+    torch.save({"script": "ppo_gru", "args": {}, "weights": {}, "step": step}, folder / "model.pt")
+
+
+def test_final_weights_are_scored_as_their_evaluations_are(tmp_path, monkeypatch):
+    agent = {"metrics": {"return": {"scores": [[[1.0]]]}}}
     (tmp_path / "test_scores.json").write_text(json.dumps([{"agents": [agent]}]))
     lines = []
     done = subprocess.CompletedProcess((), 0)
@@ -245,9 +250,8 @@ def test_weights_of_an_earlier_step_are_not_scored(tmp_path, monkeypatch):
     config = learning.Config(folder=tmp_path)
     plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU --eval-max-steps 123", 1)
     run = evaluate.RunLog(str(tmp_path), {}, {name: (np.array([96]), np.ones(1)) for name in evaluate.SECONDS.values()})
-    with pytest.raises(SystemExit, match="has weights of step 64, not 96"):
-        learning.test_scores(config, plan, run)
-    assert "--max-steps 123" in lines[0], "as its evaluations have"
+    assert learning.test_scores(config, plan, run) == {"test/return": ([96], 1.0)}
+    assert "--max-steps 123" in lines[0]
 
 
 @pytest.mark.parametrize(("last", "tested"), [(None, True), (64, True), ("end", False)])
@@ -261,7 +265,7 @@ def test_a_run_without_a_score_at_its_end_is_no_result(last, tested, tmp_path, m
         curves["eval/commands_completed"] = np.array([end if last == "end" else last]), np.ones((1, 1, 1))
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / "model.pt").touch()
+    write_model(folder, end)
     run = evaluate.RunLog(str(folder), plan.logged_args(), curves)
     monkeypatch.setattr(learning, "runs_in", lambda place, plan: [run])
     test = {"test/commands_completed": ([end], np.ones((1, 5, 1)))} if tested else {}

@@ -18,6 +18,7 @@ from test_environments import box, register, roll
 
 import ppo_gru
 from ppo_utils import environments, evaluation, runs
+from ppo_utils.checkpoints import read_model
 from ppo_utils.environments import env_actions, envs_for, final_numbers, find_spec, ground_truth_of, make_envs
 from ppo_utils.observations import Part, WrongValue
 from ppo_utils.processes import RunError
@@ -282,12 +283,15 @@ def test_a_training_stops_before_what_is_not_finite(tiny, script, what, earned):
 
 
 class Together(gym.vector.VectorEnv):
-    """A vector environment that resets in the same step; its final_obs is one array for all lanes, or objects."""
+    """A vector environment that resets in the same step; its final_obs is one array for all lanes, or objects.
+
+    kind: the type of what says that an episode ended.
+    """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
-    def __init__(self, num_envs, as_objects, nested, render_mode=None):
-        self.num_envs, self.as_objects, self.nested = num_envs, as_objects, nested
+    def __init__(self, num_envs, as_objects, nested, kind=bool, render_mode=None):
+        self.num_envs, self.as_objects, self.nested, self.kind = num_envs, as_objects, nested, kind
         self.single_action_space = gym.spaces.Discrete(2)
         self.action_space = gym.spaces.MultiDiscrete([2] * num_envs)
         self.single_observation_space = gym.spaces.Dict({"a": NUMBER, "b": NUMBER}) if nested else NUMBER
@@ -313,7 +317,19 @@ class Together(gym.vector.VectorEnv):
                 for lane in np.flatnonzero(ended):
                     final[lane] = {k: v[lane] for k, v in last.items()} if self.nested else last[lane]
             infos = {"final_obs": final, "_final_obs": ended, "final_info": {"score": 3 * self.t + 1}}
-        return self._observations(self.t), np.ones(self.num_envs), ended, np.zeros(self.num_envs, bool), infos
+        truncated = np.zeros(self.num_envs, self.kind)
+        return self._observations(self.t), np.ones(self.num_envs), ended.astype(self.kind), truncated, infos
+
+
+def test_ends_that_are_no_bools(tiny):
+    trained = []
+    for kind in (bool, np.int8, np.float32, object):
+        env_id = f"Ends-{kind.__name__}-v0"
+        gym.register(env_id, vector_entry_point=Together, kwargs={"as_objects": True, "nested": False, "kind": kind})
+        folder = ppo_gru.main(tiny(env_id=env_id, total_timesteps=64, save_model=True))
+        trained.append(read_model(folder / "model.pt")["weights"])
+    for weights in trained[1:]:
+        assert all(weight.equal(trained[0][name]) for name, weight in weights.items())
 
 
 @pytest.mark.parametrize("nested", [False, True])

@@ -357,6 +357,25 @@ def test_save_and_load(tiny, opened, memory):
     assert [name for name in os.listdir(folder) if name.startswith("model")] == ["model.pt"]
 
 
+@pytest.mark.parametrize(
+    ("flags", "levels"),
+    [
+        ({"num_levels": 50}, "50 to 59"),
+        ({"num_levels": 101}, "101 to 110"),
+        ({"num_levels": 102}, None),
+        ({"start_level": 1, "num_levels": 2}, "3 to 12"),
+        ({"start_level": 1, "num_levels": 1}, None),
+        ({"num_levels": 50, "env_id": "MysteryPath-Grid-v0"}, None),
+    ],
+)
+def test_levels_of_an_evaluation_that_loaded_weights_were_trained_on(tiny, opened, capsys, flags, levels):
+    path = str(ppo_gru.main(tiny(start_level=12, num_levels=90, save_model=True)) / "model.pt")
+    capsys.readouterr()
+    opened(ppo_gru, tiny(**{"eval_levels": 10, "load_model": path, **flags}))
+    told = f"{path} was trained on levels 12 to 101, and this run is evaluated on levels {levels}; --start-level 102 "
+    assert (told in capsys.readouterr().err) == (levels is not None)
+
+
 def test_capture_video(tiny):
     pytest.importorskip("imageio_ffmpeg")
     folder = ppo_gru.main(tiny(env_id="MortarMayhemB-Grid-v0", capture_video=True))

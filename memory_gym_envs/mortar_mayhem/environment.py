@@ -15,7 +15,14 @@ from memory_gym_envs.mortar_mayhem.arena import COMMANDS, FLOORS, TILE, TORUS_SI
 from memory_gym_envs.mortar_mayhem.drawing import circle_target, draw
 from memory_gym_envs.mortar_mayhem.levels import sample_level, write_level
 from memory_gym_envs.mortar_mayhem.options import VARIANTS, VECTOR_COMMANDS, MortarVariant
-from memory_gym_envs.mortar_mayhem.rules import burn_agents, extend_sequence, extinguish_tiles, ignite_tiles, show_clue
+from memory_gym_envs.mortar_mayhem.rules import (
+    burn_agents,
+    extend_sequence,
+    extinguish_tiles,
+    ignite_tiles,
+    on_target,
+    show_clue,
+)
 from memory_gym_envs.mortar_mayhem.state import State
 from memory_gym_envs.mortar_mayhem.vectors import make_vector_tables, make_vectors
 from memory_gym_envs.state import empty, make_room
@@ -278,9 +285,10 @@ class MortarMayhem(MemoryGymVectorEnv):
         numbers = {"reward": s.episode_return[lanes], "length": s.length[lanes]}
         if self.variant.endless:
             return numbers | {"commands_completed": s.completed[lanes], "max_command_sequence": s.count[lanes] - 1}
-        success = (s.current[lanes] >= s.count[lanes]).astype(np.int64)
-        share = (s.current[lanes] - 1 + success) / s.count[lanes]
-        return numbers | {"success": success, "commands_completed": share}
+        success = s.current[lanes] >= s.count[lanes]
+        failed = s.burning[lanes] & ~on_target(s, lanes) & ~success
+        share = (s.current[lanes] - failed) / s.count[lanes]
+        return numbers | {"success": success.astype(np.int64), "commands_completed": share}
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Circles the lane's target tile in its magnified frame, in place."""

@@ -103,6 +103,23 @@ def test_failing_at_the_last_command(env_id):
 
 
 @pytest.mark.parametrize("env_id", BOUNDS)
+def test_commands_completed_before_a_time_limit(env_id):
+    """As many as were paid for: none while they are shown, and all that were checked, also while the fire burns."""
+    found = set()
+    for limit in range(1, BOUNDS[env_id][1], 3):
+        envs = gym.make_vec(env_id, num_envs=2, max_episode_steps=limit)
+        envs.reset(seed=3)
+        truncated = [False]
+        while not truncated[0]:
+            _, _, terminated, truncated, infos = envs.step(player(envs.unwrapped))
+        assert not terminated.any()
+        final = infos["final_info"]
+        assert final["commands_completed"] == pytest.approx(final["reward"])  # 0.1 for each of ten
+        found |= {*final["commands_completed"].round(1).tolist()}
+    assert found == {i / 10 for i in range(10)}
+
+
+@pytest.mark.parametrize("env_id", BOUNDS)
 def test_walking_into_the_fire(env_id):
     """The command that was already checked no longer counts, and the step pays the failure reward."""
     env = gym.make(env_id).unwrapped
