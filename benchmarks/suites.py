@@ -150,10 +150,10 @@ LAPTOP = {
         "MortarMayhem-v0": 6,
         "MortarMayhem-Grid-v0": 6,
         "MortarMayhemB-Grid-v0": 6,
-        "Endless-MortarMayhem-v0": 3,
+        "Endless-MortarMayhem-v0": 9,
         "Endless-MysteryPath-v0": 3,
         "SearingSpotlights-v0": 6,
-        "Endless-SearingSpotlights-v0": 3,
+        "Endless-SearingSpotlights-v0": 9,
     }.items()
 }
 # In the full tasks, transformers have about as many parameters as the GRU.

@@ -381,7 +381,7 @@ def ground_truth_of(infos: dict[str, Any], args: Any, before: np.ndarray | None 
         lacking = [place.number for truth, (_, place) in zip(truths, infos[OWN], strict=True) if truth is None]
     else:
         truths = infos.get("ground_truth")
-        lacking = np.flatnonzero(~np.atleast_1d(infos.get("_ground_truth", truths is not None)))
+        lacking = np.flatnonzero(np.logical_not(np.atleast_1d(infos.get("_ground_truth", truths is not None))))
     wanted = "--ground-truth-coef needs ground_truth in every info, of every reset and step"
     if len(lacking):
         raise RunError(f"{wanted}; environment {lacking[0]} reports none; use 0")

@@ -161,6 +161,13 @@ def test_the_ground_truth_is_each_lanes(tiny):
     assert ground_truth_of(infos, args).tolist() == [[0, 1], [1, 1], [2, 1]]
 
 
+def test_a_mask_of_integers_says_who_reports_a_ground_truth(tiny):
+    args, infos = tiny(ground_truth_coef=0.1), {"ground_truth": np.eye(3)}
+    assert np.array_equal(ground_truth_of({**infos, "_ground_truth": np.ones(3, np.int8)}, args), np.eye(3))
+    with pytest.raises(RunError, match="environment 1 reports none"):
+        ground_truth_of({**infos, "_ground_truth": np.array([1, 0, 1])}, args)
+
+
 # ---- observations ----
 PICTURE = box(0, 255, (40, 48, 3), np.uint8)
 
