@@ -27,7 +27,15 @@ import tyro
 from torch import Tensor, nn
 
 from ppo_utils.checkpoints import import_script, load_weights, make_agent, read_model, saved_args
-from ppo_utils.environments import as_tensors, envs_for, final_numbers, is_memory_gym, with_options, wrappers_of
+from ppo_utils.environments import (
+    as_tensors,
+    envs_for,
+    final_numbers,
+    ground_truths,
+    is_memory_gym,
+    with_options,
+    wrappers_of,
+)
 from ppo_utils.evaluation import first_unseen
 from ppo_utils.processes import RunError
 from ppo_utils.video import as_image, check_draws
@@ -178,8 +186,8 @@ def play(
     while not episode.finished and len(episode.actions) < max_steps:
         for name, frame in views(envs, obs, stacked).items():
             episode.film(name, frame)
-        if "ground_truth" in infos:
-            episode.truth.append(infos["ground_truth"][0])
+        if family or agent.estimator is not None:  # of other packages, training has seen that there is one
+            episode.truth.append(np.asarray(ground_truths(infos)[0]))
         step = len(episode.actions)
         if family and family.shows(envs.unwrapped.state):
             episode.events[family.shown].append(step)
@@ -195,7 +203,7 @@ def play(
 
 
 def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode, deterministic: bool) -> Tensor:
-    """Return actions (1, A), as `get_action_and_value` or `most_probable`; add what was computed to the episode."""
+    """Return actions (1, A), as `evaluation.act` does; add what was computed to the episode."""
     x = agent.encoder(obs)
     y, stored = agent.memory.step(memory, x)
     if hasattr(agent.memory, "attended_rows"):  # a transformer
@@ -390,15 +398,14 @@ def main(config: Config) -> str:
 
 
 def check(config: Config) -> None:
-    """Raise ValueError or OSError for a flag that is out of range, or a page that has no folder."""
+    """Raise ValueError or OSError for a flag that is out of range, or a page that cannot be written."""
     for name, value, most in (("max-steps", config.max_steps, 100_000), ("levels", config.levels, 100)):
         if not 1 <= value <= most:
             raise ValueError(f"--{name} is {value}; it must be from 1 to {most}")
     if config.seed is not None and not 0 <= config.seed <= 2**63 - config.levels:
         raise ValueError(f"--seed is {config.seed}; levels must be from 0 to 2 ** 63 - 1")
-    folder = Path(config.out).parent
-    if not folder.is_dir():
-        raise OSError(f"--out is {config.out}, but there is no folder {folder}")
+    if not Path(config.out).parent.is_dir() or Path(config.out).is_dir():
+        raise OSError(f"--out is {config.out}; it must be a file in a folder that is there")
 
 
 def options_of(args: Any) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -45,8 +45,8 @@ from tqdm import tqdm
 
 from ppo_utils.checkpoints import RENAMED, import_script, load_weights, make_agent, read_model, saved_args
 from ppo_utils.environments import envs_for, with_options
-from ppo_utils.evaluation import evaluate, evaluation_levels
-from ppo_utils.flags import flag
+from ppo_utils.evaluation import are_trained_on, evaluate, evaluation_levels, first_unseen
+from ppo_utils.flags import NonNegativeInt, PositiveInt, check_bounds
 from ppo_utils.processes import RunError
 
 try:
@@ -87,20 +87,20 @@ class Config:
 
     checkpoints: tyro.conf.Positional[tuple[str, ...]] = ()
     """model files: model.pt that --save-model wrote, or those that were written during training"""
-    levels: int = 50
+    levels: PositiveInt = 50
     """levels to play"""
-    start_level: int | None = None
+    start_level: NonNegativeInt | None = None
     """the first of these levels (default: the first after those of the training; an agent that trained without a limit,
     --num-levels 0, has met none of the numbered levels)"""
-    repeats: int = 3
+    repeats: PositiveInt = 3
     """how often to play each level"""
-    max_steps: int = 10_000
+    max_steps: PositiveInt = 10_000
     """steps after which an endless episode is cut short"""
     env_options: str | None = None
     """reset options of a Memory Gym environment as JSON, over those of the training"""
     deterministic: bool = False
     """take the most probable actions instead of drawing them"""
-    seed: int = 1
+    seed: NonNegativeInt = 1
     """seed of the actions"""
     cuda: bool = True
     """play on the GPU when there is one"""
@@ -515,11 +515,10 @@ def add_legend(figure: Figure, tasks: dict[str, Runs], styles: dict[str, dict]) 
     lines, texts = [], []
     for label in styles:
         counts = [len(agents[label]) for agents in tasks.values() if label in agents]
-        if counts:
-            least, most = min(counts), max(counts)
-            seeds = f"{most} seed{'s' * (most > 1)}" if least == most else f"{least} to {most} seeds"
-            lines.append(Line2D([], [], **styles[label]))
-            texts.append(textwrap.fill(f"{label}, {seeds}", LABEL_WIDTH, break_on_hyphens=False))
+        least, most = min(counts), max(counts)
+        seeds = f"{most} seed{'s' * (most > 1)}" if least == most else f"{least} to {most} seeds"
+        lines.append(Line2D([], [], **styles[label]))
+        texts.append(textwrap.fill(f"{label}, {seeds}", LABEL_WIDTH, break_on_hyphens=False))
     widest = 0.8 + 0.085 * max(len(line) for text in texts for line in text.splitlines())  # inches
     columns = max(1, int(figure.get_figwidth() / widest))
     figure.set_figheight(figure.get_figheight() + 0.22 * sum(text.count("\n") + 1 for text in texts) / columns)
@@ -530,14 +529,13 @@ def add_legend(figure: Figure, tasks: dict[str, Runs], styles: dict[str, dict]) 
 def draw_tasks(
     tasks: dict[str, Runs], out: str, metrics: dict[str, tuple[str, ...]], over: str = "steps"
 ) -> dict[str, dict[str, dict[str, np.ndarray]]]:
-    """Draw each task and metric to OUT.png and OUT.svg; tasks: the runs, if any, by the task's title and agent's label.
+    """Draw each task and metric to OUT.png and OUT.svg; tasks: the runs by the task's title and agent's label.
 
     Metrics are by title, as many for each task. Return the last scores (R, M, E) by title, label and name of the curve.
     """
-    labels = dict.fromkeys(itertools.chain(*tasks.values()))  # also of agents without runs: others keep their colours
+    labels = dict.fromkeys(itertools.chain(*tasks.values()))
     looks = itertools.cycle(itertools.product(("-", "--", ":"), color_sequences["tab10"]))
     styles = {label: {"linestyle": line, "color": color} for label, (line, color) in zip(labels, looks, strict=False)}
-    tasks = {title: {label: runs for label, runs in agents.items() if runs} for title, agents in tasks.items()}
     figure, grid = blank_pictures(len(tasks), max(map(len, metrics.values())))
     last = defaultdict(lambda: defaultdict(dict))
     for axes, (title, agents) in zip(grid, tasks.items(), strict=True):
@@ -697,10 +695,9 @@ def play(checkpoint: Checkpoint, config: Config) -> dict[str, np.ndarray]:
 
 def title_of(args: dict[str, Any], config: Config) -> str:
     """Name the task and the levels of it that are played."""
-    after = args["start_level"] + args["num_levels"]
-    first = after if config.start_level is None else config.start_level
-    met = args["num_levels"] and first < after and first + config.levels > args["start_level"]
-    trained_on = " (of its training)" if met else ""
+    training = SimpleNamespace(**args)
+    first = first_unseen(training) if config.start_level is None else config.start_level
+    trained_on = " (of its training)" if are_trained_on(training, first, config.levels) else ""
     levels = f"levels {first} to {first + config.levels - 1}{trained_on}, {config.repeats} times each"
     return f"{task_of(args)}, {levels}{', most probable actions' if config.deterministic else ''}"
 
@@ -753,9 +750,7 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
 
 def check_numbers(config: Config) -> None:
     """Raise ValueError for the first number that cannot work."""
-    for name, low in (("levels", 1), ("repeats", 1), ("max_steps", 1), ("seed", 0), ("start_level", 0)):
-        if not low <= (getattr(config, name) or 0) < 2**63:
-            raise ValueError(f"{flag(name)} is {getattr(config, name)}; it must be from {low} to 2 ** 63 - 1")
+    check_bounds(config)
     if (episodes := config.levels * config.repeats) > MOST_EPISODES:
         raise ValueError(f"--levels x --repeats is {episodes}; at most {MOST_EPISODES} are played")
 
@@ -770,13 +765,13 @@ def main(config: Config) -> None:
     if bool(config.checkpoints) == bool(config.curves):
         raise ValueError("give either checkpoints to play with (runs/*/model.pt), or --curves and run folders (runs/*)")
     check_numbers(config)
-    for path in (config.json, config.out):
-        if path is not None and not os.path.isdir(os.path.dirname(path) or "."):
-            raise ValueError(f"there is no folder {os.path.dirname(path)} to write to")
     if not os.path.basename(config.out):
         raise ValueError(f"--out {config.out} is a folder; give the files' name too, as {config.out}curves")
-    if config.json is not None and os.path.isdir(config.json):
-        raise ValueError(f"--json {config.json} is a folder; give a file to write to")
+    if config.json is not None:
+        if not os.path.isdir(os.path.dirname(config.json) or "."):
+            raise ValueError(f"there is no folder {os.path.dirname(config.json)} to write to")
+        if os.path.isdir(config.json):
+            raise ValueError(f"--json {config.json} is a folder; give a file to write to")
     report = draw_curves(config) if config.curves else score_checkpoints(config)
     if config.json is not None:
         Path(config.json).write_text(json.dumps(report, indent=1))

@@ -8,7 +8,7 @@ process. The processes are forks of this one, so that these seconds are setup, t
 
 The soak writes a checkpoint after every iteration. Resident memory, open files and steps per second should be flat.
 
-The cost of checkpoints is measured with the settings of both presets: the seconds of an iteration and of a checkpoint,
+The cost of checkpoints is measured with the settings of each preset: the seconds of an iteration and of a checkpoint,
 and the share of the time that checkpoints take at the default --checkpoint-interval. All is done by one thread.
 """
 

@@ -23,6 +23,7 @@ import tyro
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
 import ppo_trxl
+from ppo_utils.runs import close
 
 
 @dataclass
@@ -54,7 +55,7 @@ def kept_for_backward(run, args: ppo_trxl.Args) -> list[torch.Tensor]:
         return tensor
 
     memory, rollout = run.agent.memory, run.rollout
-    minibatch = next(memory.cut(rollout.terminated).minibatches(args.num_minibatches))
+    minibatch = next(memory.cut(rollout.done).minibatches(args.num_minibatches))
     x = torch.randn(int(minibatch.length.sum()), memory.width, requires_grad=True)
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
         memory.unroll(rollout.memory_state, x, minibatch)
@@ -64,10 +65,12 @@ def kept_for_backward(run, args: ppo_trxl.Args) -> list[torch.Tensor]:
 
 def shares(config: Config) -> None:
     """Print the resident memory after an iteration, and the memory's own share."""
-    args = ppo_trxl.Args(env_id=config.env_id, num_steps=config.num_steps, total_timesteps=32 * config.num_steps)
+    steps = {"num_steps": config.num_steps, "total_timesteps": 32 * config.num_steps}
+    args = ppo_trxl.Args(env_id=config.env_id, cuda=False, **steps)
     run = ppo_trxl.setup(args)
     ppo_trxl.train(args, run)
     resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6  # kilobytes on Linux
+    close(run)
     memory = run.rollout.memory_state
     rows = {
         "highest resident memory, all in all": resident,

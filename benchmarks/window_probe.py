@@ -20,6 +20,7 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
 
 import evaluate
+from ppo_utils.processes import RunError
 
 
 @dataclass
@@ -71,7 +72,7 @@ def main(config: Config) -> None:
 if __name__ == "__main__":
     try:
         main(tyro.cli(Config))
-    except (ValueError, OSError, ImportError, gym.error.Error) as error:
+    except (ValueError, OSError, ImportError, gym.error.Error, RunError) as error:
         sys.exit(f"window_probe.py: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
         sys.exit(130)

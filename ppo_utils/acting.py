@@ -10,7 +10,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 
 from ppo_utils.checkpoints import import_script, load_weights, make_agent, read_model, saved_args
 from ppo_utils.environments import as_tensors, env_actions, envs_for, wrap_envs, wrappers_of
-from ppo_utils.evaluation import MEMORY_STEPS, most_probable
+from ppo_utils.evaluation import MEMORY_STEPS, act
 from ppo_utils.lanes import check_fits
 
 
@@ -51,15 +51,9 @@ class Player:
         """
         self.given.now = observation, reward
         obs = self.envs.reset()[0] if self.actions is None else self.envs.step(self.actions)[0]
-        if self.steps % MEMORY_STEPS == 0:
-            self.agent.memory.begin_rollout(self.memory, self.agent.memory.carry(self.memory))
-        self.steps += 1
         obs = as_tensors(obs, torch.device("cpu"))
-        if self.deterministic:
-            actions = most_probable(self.agent, obs, self.memory)
-        else:
-            actions, _, _ = self.agent.get_action_and_value(obs, self.memory)
-        self.actions = actions.numpy()
+        self.actions = act(self.agent, obs, self.memory, self.steps, self.deterministic).numpy()
+        self.steps += 1
         action = env_actions(self.given.single_action_space, self.actions)[0]
         return action if np.ndim(action) else int(action)
 

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from ppo_utils.environments import ground_truth_of, load_state, save_state
-from ppo_utils.evaluation import first_unseen
+from ppo_utils.evaluation import are_trained_on, first_unseen
 from ppo_utils.flags import as_flags, flag
 from ppo_utils.processes import all_gather, rank_and_size
 
@@ -123,7 +123,8 @@ def map_nested(value: Any, kind: type, function: Callable) -> Any:
 # ---- reading ----
 def checkpoints_in(folder: str | Path) -> list[Path]:
     """Return the checkpoints of a run, the latest last."""
-    found = {int(path.stem[11:]): path for path in Path(folder).glob("checkpoint-*.pt") if path.stem[11:].isdecimal()}
+    steps = {path: path.stem.removeprefix("checkpoint-") for path in Path(folder).glob("checkpoint-*.pt")}
+    found = {int(step): path for path, step in steps.items() if step.isdecimal()}
     return [found[step] for step in sorted(found)]
 
 
@@ -240,7 +241,7 @@ def check_resumed(args: Any, saved: dict[str, Any], script: str) -> None:
 
 
 def load_model(args: Any, agent: nn.Module, script: str) -> None:
-    """Give the agent the weights of --load-model; say so if they were trained on levels that this run is evaluated on.
+    """Give the agent the weights of --load-model; say so if they were trained on levels of this run's evaluations.
 
     Raises ValueError if another script, or one with other flags of the network, trained them; OSError without a file.
     """
@@ -256,11 +257,11 @@ def load_model(args: Any, agent: nn.Module, script: str) -> None:
         raise ValueError(f"{path} was trained with {theirs}, not with {ours}")
     load_weights(agent, saved, path)
     first, beyond = first_unseen(args), first_unseen(theirs)
-    met = theirs.num_levels and first < beyond and first + args.eval_levels > theirs.start_level
+    met = are_trained_on(theirs, first, args.eval_levels)
     if met and theirs.env_id == args.env_id and rank_and_size()[0] == 0:
         print(
-            f"{path} was trained on levels {theirs.start_level} to {beyond - 1}, and this run is evaluated on levels "
-            f"{first} to {first + args.eval_levels - 1}; --start-level {beyond} makes them unseen ones",
+            f"{path} was trained on levels {theirs.start_level} to {beyond - 1}, and evaluations of this run play "
+            f"levels {first} to {first + args.eval_levels - 1}; --start-level {beyond} makes them unseen ones",
             file=sys.stderr,
         )
 

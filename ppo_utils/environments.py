@@ -194,8 +194,8 @@ def save_state(envs: VectorEnv) -> dict[str, Any] | None:
     They may be in a `LaneVideo`, whose state is the number of the episode.
     Saved are: every array of the environment, with the levels that are being played; each lane's generator and its
     seed, and the one that chooses levels; the present options, which automatic resets keep; frame stacks, step numbers
-    and last actions; the lights of the perturbation and their generators; returns and lengths of the episodes so far,
-    and of the last ended ones. Not saved are an episode's seconds, which count from `load_state`, and a video that is
+    and last actions; the lights of the perturbation and their generators; returns and lengths of the episodes so far.
+    Not saved are an episode's seconds, which count from `load_state`, and a video that is
     being recorded: the next scheduled episode has one again.
 
     All values are plain: dicts with str keys, lists, tuples, str, int, float, bool, None, and NumPy arrays of numbers
@@ -376,15 +376,12 @@ def ground_truth_of(infos: dict[str, Any], args: Any, before: np.ndarray | None 
     """
     if not args.ground_truth_coef:
         return None
-    if OWN in infos:
-        truths = [info.get("ground_truth") for info, _ in infos[OWN]]
-        lacking = [place.number for truth, (_, place) in zip(truths, infos[OWN], strict=True) if truth is None]
-    else:
-        truths = infos.get("ground_truth")
-        lacking = np.flatnonzero(np.logical_not(np.atleast_1d(infos.get("_ground_truth", truths is not None))))
     wanted = "--ground-truth-coef needs ground_truth in every info, of every reset and step"
-    if len(lacking):
-        raise RunError(f"{wanted}; environment {lacking[0]} reports none; use 0")
+    truths = ground_truths(infos)
+    for lane, truth in enumerate(truths if isinstance(truths, list) else ()):
+        if truth is None:
+            number = infos[OWN][lane][1].number if OWN in infos else lane
+            raise RunError(f"{wanted}; environment {number} reports none; use 0")
     try:
         truth = np.asarray(truths, np.float32)
     except (TypeError, ValueError):
@@ -392,6 +389,16 @@ def ground_truth_of(infos: dict[str, Any], args: Any, before: np.ndarray | None 
     if truth.ndim != 2 or not np.isfinite(truth).all() or (before is not None and truth.shape != before.shape):
         raise RunError(f"{wanted}: an array of numbers, as many in all environments and always, and finite; use 0")
     return truth
+
+
+def ground_truths(infos: dict[str, Any]) -> Any:
+    """Return the environments' ground truths: a batch, or a list where some may report none, which is None there."""
+    if OWN in infos:  # of environments that are made one by one
+        return [info.get("ground_truth") for info, _ in infos[OWN]]
+    truths, reported = infos.get("ground_truth", [None]), infos.get("_ground_truth", True)
+    if np.all(reported):
+        return truths
+    return [truth if there else None for truth, there in zip(truths, reported, strict=True)]
 
 
 def add_ended(episodes: defaultdict[str, list[float]], infos: dict[str, Any], done: np.ndarray) -> None:
@@ -406,17 +413,17 @@ def add_ended(episodes: defaultdict[str, list[float]], infos: dict[str, Any], do
             episodes[f"episode/{name}"] += values[~np.isnan(values)].tolist()
 
 
-def final_numbers(infos: dict[str, Any], lanes: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the numbers in the final infos of the given lanes by name, (N,) float64 each, NaN where a lane has none.
+def final_numbers(infos: dict[str, Any], ended: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the numbers in the final infos of ended episodes by name, (N,) float64 each, NaN where a lane has none.
 
-    What is no finite number is left out, and a line on stderr says so, once for each name. lanes: (N,) bool.
+    What is no finite number is left out, and a line on stderr says so, once for each name. ended: (N,) bool.
     """
     numbers = {}
-    for lane in np.flatnonzero(lanes).tolist():
+    for lane in np.flatnonzero(ended).tolist():
         for name, value in final_info_of(infos, lane).items():
             number = as_number(value)
             if number is not None:
-                numbers.setdefault(str(name), np.full(len(lanes), np.nan))[lane] = number
+                numbers.setdefault(str(name), np.full(len(ended), np.nan))[lane] = number
             elif name != "ground_truth":
                 tell_left_out(name)
     return numbers
@@ -455,14 +462,14 @@ def tell_left_out(name: str) -> None:
 
 
 def final_observations(
-    observations: dict[str, np.ndarray], infos: dict[str, Any], lanes: np.ndarray
+    observations: dict[str, np.ndarray], infos: dict[str, Any], ended: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return copies of observations (N, ...) in which the given lanes hold the last one of the episode that just ended.
+    """Return copies of observations (N, ...) that hold the last one of an episode where one has just ended.
 
-    lanes: (N,) bool.
+    ended: (N,) bool.
     """
     observations = {name: part.copy() for name, part in observations.items()}
-    for lane in np.flatnonzero(lanes):
+    for lane in np.flatnonzero(ended):
         for name, part in infos["final_obs"][lane].items():
             observations[name][lane] = part
     return observations

@@ -21,14 +21,26 @@ def first_unseen(args: Any) -> int:
     return args.start_level + args.num_levels
 
 
+def are_trained_on(args: Any, first: int, levels: int) -> bool:
+    """Return whether a script's arguments train on any of so many levels from `first` on; without a limit, on none."""
+    return max(first, args.start_level) < min(first + levels, first_unseen(args))
+
+
 def evaluation_levels(args: Any, levels: int, repeats: int = REPEATS, first: int | None = None) -> list[int]:
     """Return the seeds (N,) of an evaluation's levels, with repeats: from `first`, or from the first unseen one."""
     first = first_unseen(args) if first is None else first
     return [level for level in range(first, first + levels) for _ in range(repeats)]
 
 
-def most_probable(agent: nn.Module, obs: dict[str, Tensor], state: Any) -> Tensor:
-    """Return each branch's most probable action, (N, A), and move the memory's state on, as `get_action_and_value`."""
+def act(agent: nn.Module, obs: dict[str, Tensor], state: Any, step: int, deterministic: bool) -> Tensor:
+    """Return actions (N, A), sampled or each branch's most probable one, and move the memory's state on.
+
+    step: how many came before, however many; the state has room for MEMORY_STEPS.
+    """
+    if step % MEMORY_STEPS == 0:
+        agent.memory.begin_rollout(state, agent.memory.carry(state))
+    if not deterministic:
+        return agent.get_action_and_value(obs, state)[0]
     x, hidden = agent.memory.step(state, agent.encoder(obs))
     agent.memory.advance(state, hidden)
     policy, _, _ = agent.heads(x)
@@ -59,12 +71,7 @@ def evaluate(
     metrics = {"return": np.zeros(len(levels)), "length": np.zeros(len(levels))}
     with torch.autocast(device.type, torch.bfloat16, enabled=amp):
         for t in range(max_steps):
-            if t % MEMORY_STEPS == 0:
-                agent.memory.begin_rollout(memory, agent.memory.carry(memory))
-            if deterministic:
-                actions = most_probable(agent, as_tensors(obs, device), memory)
-            else:
-                actions, _, _ = agent.get_action_and_value(as_tensors(obs, device), memory)
+            actions = act(agent, as_tensors(obs, device), memory, t, deterministic)
             obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
             done = terminated | truncated
             agent.memory.reset(memory, torch.as_tensor(done))

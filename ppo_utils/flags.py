@@ -73,6 +73,18 @@ def as_flags(values: dict[str, Any]) -> str:
     )
 
 
+def check_bounds(args: Any) -> None:
+    """Raise ValueError, naming the flag and what it may be, for a dataclass' first number that is out of bounds."""
+    for name, kind in get_type_hints(type(args), include_extras=True).items():
+        value = getattr(args, name)
+        for part in (kind, *get_args(kind)):  # float | None has its bounds in a part
+            bounds = next((each for each in getattr(part, "__metadata__", ()) if isinstance(each, Bounds)), None)
+            if bounds is not None and value is not None and not bounds.include(value):
+                raise ValueError(f"{flag(name)} is {value}; it must be {bounds}")
+        if isinstance(value, int) and value >= 2**63:  # torch and NumPy take no more
+            raise ValueError(f"{flag(name)} is {value}; it must be below 2 ** 63")
+
+
 def check_args(args: Any) -> None:
     """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work.
 
@@ -92,12 +104,7 @@ def check_args(args: Any) -> None:
             raise ValueError(f"{flag(name)} is {value!r}; it must be of type {kinds[0].__name__}")
         if is_choice and value not in get_args(kind):
             raise ValueError(f"{flag(name)} is {value!r}; it must be one of {', '.join(get_args(kind))}")
-        for part in (kind, *get_args(kind)):  # float | None has its bounds in a part
-            bounds = next((each for each in getattr(part, "__metadata__", ()) if isinstance(each, Bounds)), None)
-            if bounds is not None and value is not None and not bounds.include(value):
-                raise ValueError(f"{flag(name)} is {value}; it must be {bounds}")
-        if isinstance(value, int) and value >= 2**63:  # torch and NumPy take no more
-            raise ValueError(f"{flag(name)} is {value}; it must be below 2 ** 63")
+    check_bounds(args)
     if not args.exp_name or set(args.exp_name) & set("/\\"):
         raise ValueError(f"--exp-name is {args.exp_name!r}; it must be a name without slashes")
     for name in ("reconstruction", "ground_truth"):

@@ -7,7 +7,7 @@ import contextlib
 import copy
 import functools
 import inspect
-import signal
+import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
-from gymnasium.vector.async_vector_env import AsyncState
+from gymnasium.vector.async_vector_env import AsyncState, _async_worker
 
 from memory_gym_envs.options import brief
 from ppo_utils.processes import RunError
@@ -82,9 +82,10 @@ class Lane(gym.Wrapper):
             self._rng = np.random.default_rng(seed)
         elif self._levels.count:
             seed = self._levels.first + int(self._rng.integers(self._levels.count))
+        where = f"the reset after {self._place.step}"
         if seed is not None:
-            self._seed, self._steps = seed, 0
-        with self._located("the reset after "):
+            self._seed, self._steps, where = seed, 0, f"its reset with seed {seed}"
+        with self._located(where):
             observation, info = self.env.reset(seed=seed, options=options)
             check_fits(self.observation_space, observation)
             return observation, {OWN: (dict(info), self._place)}
@@ -92,7 +93,7 @@ class Lane(gym.Wrapper):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step the environment. Raises LaneError for what it raises, RunError for what it should not return."""
         self._steps += 1
-        with self._located(""):
+        with self._located():
             observation, reward, terminated, truncated, info = self.env.step(action)
             check_fits(self.observation_space, observation)
             reward, info = one_number(reward), dict(info)
@@ -101,6 +102,13 @@ class Lane(gym.Wrapper):
             with contextlib.suppress(Exception):  # something in it cannot be copied
                 info = copy.deepcopy(info)
         return observation, reward, terminated, truncated, {OWN: (info, self._place)}
+
+    def render(self) -> Any:
+        """Return the image; None, and a line on stderr, if that raises: a process of its own would end with it."""
+        try:
+            return self.env.render()
+        except Exception as error:
+            print(f"environment {self._number} raised {error!r} when it was drawn", file=sys.stderr)
 
     def close(self) -> None:
         """Close the environment; what it raises is a line on stderr, since nothing that follows needs it."""
@@ -114,14 +122,14 @@ class Lane(gym.Wrapper):
         return Place(self._number, self._seed, self._steps)
 
     @contextlib.contextmanager
-    def _located(self, where: str) -> Iterator[None]:
+    def _located(self, where: str = "") -> Iterator[None]:
         """Say of errors in which environment and step they were."""
         try:
             yield
         except UnfitError as error:
             raise RunError(f"{self.unwrapped.spec.id}: {error} ({self._place})") from None
         except Exception as error:
-            what = f"environment {self._number} raised {type(error).__name__} in {where}{self._place.step}"
+            what = f"environment {self._number} raised {type(error).__name__} in {where or self._place.step}"
             raise LaneError(": ".join(filter(None, [what, one_line(error)]))) from error
 
 
@@ -132,7 +140,7 @@ class AsyncLanes(AsyncVectorEnv):
         self._first_lane = first_lane  # the number of the first one, among those of all processes
         self._pending = False  # a call has begun, and has not come to its end
         # Not all spaces can be in shared memory.
-        super().__init__(lanes, autoreset_mode=AutoresetMode.SAME_STEP, shared_memory=False)
+        super().__init__(lanes, autoreset_mode=AutoresetMode.SAME_STEP, shared_memory=False, worker=work_apart)
 
     def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
         """Reset all lanes."""
@@ -182,7 +190,7 @@ def same_step_envs(
     if spec.entry_point is None:
         raise ValueError(f"{spec.id} has no single environments, which --async-envs needs")
     check_kwargs(spec.id, creator(spec.entry_point), kwargs)
-    make = functools.partial(make_lane, spec, kwargs, levels, asynchronous)
+    make = functools.partial(make_lane, spec, kwargs, levels)
     lanes = [functools.partial(make, first_lane + lane) for lane in range(num_envs)]
     if asynchronous:
         envs = AsyncLanes(lanes, first_lane)
@@ -192,10 +200,18 @@ def same_step_envs(
     return envs
 
 
-def make_lane(spec: EnvSpec, kwargs: dict[str, Any], levels: Levels, asynchronous: bool, number: int) -> Lane:
-    """Make one environment, in a process of its own if asynchronous."""
-    if asynchronous:  # Ctrl-C reaches all processes, and it is the first one that stops the training
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+def work_apart(*arguments: Any) -> None:
+    """Step a lane as Gymnasium does, in a session of its own.
+
+    Signals to the training's process group, such as Ctrl-C or that of `timeout`, are for the first process: it ends the
+    iteration, for which it needs all lanes, and then the lanes.
+    """
+    os.setsid()
+    _async_worker(*arguments)
+
+
+def make_lane(spec: EnvSpec, kwargs: dict[str, Any], levels: Levels, number: int) -> Lane:
+    """Make one environment."""
     return Lane(gym.make(spec, **kwargs), number, levels)
 
 
@@ -264,7 +280,7 @@ def one_line_errors(what: str) -> Iterator[None]:
     except RunError:
         raise
     except Exception as error:
-        first = error.__cause__ if isinstance(error, RuntimeError) and error.__cause__ else error  # see Lane
+        first = error.__cause__ if isinstance(error, LaneError) else error
         if isinstance(first, (gym.error.Error, ImportError, OSError, MemoryError)):
             raise first from None
         raise ValueError(f"{what}: {one_line(error) or repr(error)}") from error

@@ -60,7 +60,8 @@ class ObservationParts(VectorWrapper):
         """Reset the environment, its observations in parts."""
         if seed is not None:
             self._seeds, self._steps = lane_seeds(seed, self.num_envs), 0
-        observations, infos = self.env.reset(seed=seed, options=options)
+        # A copy: Gymnasium's vector environments take reset_mask out of it, which wrappers outside read afterwards.
+        observations, infos = self.env.reset(seed=seed, options=options and {**options})
         return self._convert(observations, infos), {name: infos[name] for name in INFOS if name in infos}
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], Any, Any, Any, dict[str, Any]]:

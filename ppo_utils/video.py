@@ -58,7 +58,7 @@ class LaneVideo(Saved, VectorWrapper):
         super().close(**kwargs)
 
     def _film(self) -> None:
-        """Write lane 0's image; Gymnasium's own method has all lanes draw theirs."""
+        """Write lane 0's image; lanes that are processes all draw theirs."""
         envs = self.unwrapped
         try:
             if isinstance(envs, MemoryGymVectorEnv):

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from memory_gym_envs.base import ALL, lane_seeds, one_of, overwrite
+from memory_gym_envs.base import ALL, checked_integer, lane_seeds, one_of, overwrite
 from memory_gym_envs.bits import pixels
 from memory_gym_envs.drawing import FRAME, SCREEN, gray
 from memory_gym_envs.options import brief, complete_options
@@ -155,7 +155,7 @@ class GrayscaleStack(ImageWrapper):
 
     def __init__(self, env: VectorEnv, frames: int = 4):
         super().__init__(env)
-        shape = (*self.image_shape[:2], stack_size(frames))
+        shape = (*self.image_shape[:2], checked_integer("frames", frames, 1))
         self.arguments = {"frames": shape[-1]}
         self._stack = np.zeros((self.num_envs, *shape), np.uint8)
         space = self.replaced(env.single_observation_space, gym.spaces.Box(0, 255, shape, np.uint8))
@@ -192,7 +192,7 @@ class VectorStack(SameStepWrapper):
 
     def __init__(self, env: VectorEnv, frames: int = 4):
         super().__init__(env)
-        space, frames = env.single_observation_space, stack_size(frames)
+        space, frames = env.single_observation_space, checked_integer("frames", frames, 1)
         self.arguments = {"frames": frames}
         parts = named(space)
         if not all(isinstance(part, gym.spaces.Box) and len(part.shape) == 1 for part in parts.values()):
@@ -349,12 +349,10 @@ class SpotlightPerturbation(ImageWrapper):
         super().__init__(env)
         if self.image_shape != (SCREEN, SCREEN, 3):
             raise ValueError(f"SpotlightPerturbation needs {SCREEN} x {SCREEN} pixels, not {self.image_shape}")
-        for name, value in (("opacity", opacity), ("shade", shade)):
-            if not isinstance(value, (int, np.integer)) or not 0 <= value <= 255:
-                raise ValueError(f"{name} must be an integer from 0 to 255, not {value!r}")
+        opacity, shade = checked_integer("opacity", opacity, 0, 255), checked_integer("shade", shade, 0, 255)
         self.clear, self.veil = np.uint16(255 - opacity), np.uint16(shade * opacity)
         values = complete_options(LIGHTS, lights, type(self).__name__)
-        self.arguments = {"opacity": int(opacity), "shade": int(shade), **values}
+        self.arguments = {"opacity": opacity, "shade": shade, **values}
         self._light = SearingSpotlights("SearingSpotlights-v0", self.num_envs)
         self._settings = self._light.complete_options({**values, **UNPLAYED})
         least, largest = values["spot_min_radius"], values["spot_max_radius"]
@@ -420,13 +418,6 @@ def one_hot(choices: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     found = np.zeros((len(choices), sizes.sum()), np.float32)
     found[np.arange(len(choices))[:, None], choices + (np.cumsum(sizes) - sizes)] = 1.0
     return found
-
-
-def stack_size(frames: int) -> int:
-    """Return the number of frames of a stack; raises ValueError unless it is an integer of at least 1."""
-    if not isinstance(frames, (int, np.integer)) or frames < 1:
-        raise ValueError(f"frames must be an integer of at least 1, not {frames!r}")
-    return int(frames)
 
 
 def sinusoidal(positions: np.ndarray, width: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from test_environments import shows
 
 import ppo_gru
 import ppo_trxl
-from ppo_utils import acting
+from ppo_utils import acting, evaluation
 from ppo_utils.acting import Player
 from ppo_utils.environments import envs_for
 from ppo_utils.evaluation import evaluate
@@ -52,7 +52,8 @@ def trained(tiny):
 @pytest.mark.parametrize(("env_id", "changes"), TASKS)
 def test_it_acts_as_in_an_evaluation(trained, script, env_id, changes, deterministic, monkeypatch):
     """The same episodes in single environments as in one lane of a vector environment, over two of them."""
-    monkeypatch.setattr(acting, "MEMORY_STEPS", 5)  # fewer than an episode has
+    for module in (acting, evaluation):
+        monkeypatch.setattr(module, "MEMORY_STEPS", 5)  # fewer than an episode has
     player, env = Player(trained(script, env_id=env_id, **changes), deterministic), gym.make(env_id)
     for seed in (3, 8):
         torch.manual_seed(seed)

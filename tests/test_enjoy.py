@@ -22,6 +22,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.actions.action_builder import ActionBuilder
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
+from test_environments import register
 
 import enjoy
 import evaluate
@@ -32,7 +33,7 @@ from memory_gym_envs.character import PAD
 from memory_gym_envs.mystery_path.state import ROWS
 from ppo_utils.checkpoints import make_agent
 from ppo_utils.environments import as_tensors, envs_for, is_memory_gym
-from ppo_utils.evaluation import most_probable
+from ppo_utils.evaluation import act
 
 AGENTS = {
     "GRU": (ppo_gru, {"env_id": "MysteryPath-Grid-v0", "reconstruction_coef": 0.1, "ground_truth_coef": 0.1}),
@@ -224,9 +225,9 @@ def test_most_probable_actions(saved):
     agent, envs, _ = enjoy.load("model.pt")
     obs, _ = envs.reset(seed=3)
     memory = agent.memory.initial_state(1, 40, torch.device("cpu"))
-    for actions in page["actions"]:
+    for t, actions in enumerate(page["actions"]):
         with torch.no_grad():
-            assert most_probable(agent, as_tensors(obs, torch.device("cpu")), memory).tolist() == [actions]
+            assert act(agent, as_tensors(obs, torch.device("cpu")), memory, t, True).tolist() == [actions]
         obs, *_ = envs.step(np.array([actions]))
     assert page["facts"]["actions"] == "most probable"
     assert page_of(max_steps=40)["episodes"][0]["actions"] != page["actions"]
@@ -333,6 +334,22 @@ def test_spotlights(saved):
 def test_other_environments_have_no_events(saved):
     saved(env_id="CartPole-v1")
     assert played().events == {}
+
+
+def test_the_ground_truth_of_other_environments(saved):
+    class Tells(gym.Wrapper):
+        def reset(self, **arguments):
+            self.t = 0
+            return self.env.reset(**arguments)[0], {"ground_truth": [0.0, 7.0]}
+
+        def step(self, action):
+            self.t += 1
+            return *self.env.step(action)[:4], {"ground_truth": [self.t, 7.0]}
+
+    saved(env_id=register(lambda **more: Tells(gym.make("CartPole-v1", **more))), ground_truth_coef=0.1)
+    (page,) = page_of(max_steps=4)["episodes"]
+    assert page["truth"] == [[0, 7], [1, 7], [2, 7], [3, 7]]
+    assert np.shape(page["estimate"]) == (4, 2)
 
 
 def test_an_agent_trained_in_processes_plays_in_this_one(saved):
@@ -792,7 +809,8 @@ def test_bad_input_is_one_line(saved):
         ({"seed": 2**63 - 1, "levels": 2}, "--seed is 9223372036854775807; levels must be from 0 to 2 ** 63 - 1"),
         ({"levels": 0}, "--levels is 0; it must be from 1 to 100"),
         ({"max_steps": 0}, "--max-steps is 0; it must be from 1 to 100000"),
-        ({"out": "nowhere/page.html"}, "there is no folder nowhere"),
+        ({"out": "nowhere/page.html"}, "--out is nowhere/page.html; it must be a file in a folder that is there"),
+        ({"out": "."}, "--out is .; it must be a file in a folder that is there"),
         ({"out": "."}, "directory"),
     ],
 )

@@ -5,6 +5,7 @@ Lanes of the small environments here know their number: they are made in order.
 
 import itertools
 import os
+import signal
 import sys
 
 import gymnasium as gym
@@ -20,6 +21,7 @@ import ppo_gru
 from ppo_utils import environments, evaluation, runs
 from ppo_utils.checkpoints import read_model
 from ppo_utils.environments import env_actions, envs_for, final_numbers, find_spec, ground_truth_of, make_envs
+from ppo_utils.lanes import LaneError, Levels, make_lane
 from ppo_utils.observations import Part, WrongValue
 from ppo_utils.processes import RunError
 from ppo_utils.video import LaneVideo, as_image, even, video_writer
@@ -522,9 +524,10 @@ DRAWS = {
 }
 
 
+@pytest.mark.parametrize("async_envs", [False, True])
 @pytest.mark.parametrize("name", DRAWS)
-def test_a_video_that_cannot_be_written_costs_itself(name, tiny, capfd):
-    folder = ppo_gru.main(tiny(env_id=small(draw=DRAWS[name]), capture_video=True))
+def test_a_video_that_cannot_be_written_costs_itself(name, async_envs, tiny, capfd):
+    folder = ppo_gru.main(tiny(env_id=small(draw=DRAWS[name]), capture_video=True, async_envs=async_envs))
     assert (folder / "checkpoint-128.pt").exists()
     frames = 1 if name == "other sizes" else 0
     assert f"the video of episode 0 ends after {frames} frames: " in capfd.readouterr().err
@@ -683,6 +686,18 @@ def test_a_process_that_dies():
     assert not any(process.is_alive() for process in envs.unwrapped.processes)
 
 
+def test_signals_are_for_the_first_process(tiny):
+    """Each environment is in a session of its own: Ctrl-C and `timeout` do not end it before the iteration ends."""
+    handler = signal.getsignal(signal.SIGINT)
+    envs = make_envs(small(), 2, seed=1, asynchronous=True)
+    assert signal.getsignal(signal.SIGINT) is handler
+    envs.reset()
+    list(roll(envs, 1))  # they have begun
+    processes = envs.unwrapped.processes
+    assert [os.getsid(process.pid) for process in processes] == [process.pid for process in processes]
+    envs.close()
+
+
 def test_processes_are_closed_while_a_call_is_pending(monkeypatch):
     """As after a second Ctrl-C: the answers that were read already do not come again."""
 
@@ -698,6 +713,35 @@ def test_processes_are_closed_while_a_call_is_pending(monkeypatch):
             list(roll(envs, 1))
     envs.close()
     assert not any(process.is_alive() for process in envs.unwrapped.processes)
+
+
+def test_reset_mask_counts_returns_and_lengths_from_zero_there_alone():
+    envs = make_envs(small(length=9), 3, seed=1)
+    envs.reset()
+    list(roll(envs, 5))
+    envs.reset(options={"reset_mask": np.array([True, False, False])})
+    assert envs.episode_lengths.tolist() == [0, 5, 5]
+
+
+def test_an_error_when_it_is_made_is_told_in_its_own_words():
+    def make(render_mode=None):
+        raise RuntimeError("no license; set SIM_LICENSE") from FileNotFoundError("license.txt")
+
+    with pytest.raises(ValueError, match=r"cannot be made: no license; set SIM_LICENSE$"):
+        make_envs(register(make), 1)
+
+
+@pytest.mark.parametrize(
+    ("seed", "where"), [(7, "its reset with seed 7"), (None, "the reset after step 2 since it was made")]
+)
+def test_where_a_reset_raised(seed, where):
+    broken = small(see=lambda env: 1 / 0 if env.episode and env.t == 0 else np.zeros(1, np.float32))
+    lane = make_lane(gym.spec(broken), {}, Levels(), 4)
+    lane.reset()
+    lane.step(0)
+    lane.step(0)
+    with pytest.raises(LaneError, match=f"^environment 4 raised ZeroDivisionError in {where}: division by zero$"):
+        lane.reset(seed=seed)
 
 
 class Unclosable(Small):

@@ -372,7 +372,9 @@ def test_levels_of_an_evaluation_that_loaded_weights_were_trained_on(tiny, opene
     path = str(ppo_gru.main(tiny(start_level=12, num_levels=90, save_model=True)) / "model.pt")
     capsys.readouterr()
     opened(ppo_gru, tiny(**{"eval_levels": 10, "load_model": path, **flags}))
-    told = f"{path} was trained on levels 12 to 101, and this run is evaluated on levels {levels}; --start-level 102 "
+    told = (
+        f"{path} was trained on levels 12 to 101, and evaluations of this run play levels {levels}; --start-level 102 "
+    )
     assert (told in capsys.readouterr().err) == (levels is not None)
 
 
