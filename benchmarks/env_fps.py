@@ -39,6 +39,7 @@ ORIGINALS = {
 COLUMNS = ["id", "memory-gym", "one", "ratio", "{n} lanes", "ratio", "reset, memory-gym", "reset", "ratio"]
 VECTOR_COLUMNS = ["id", "memory-gym", "{n} lanes", "ratio", "{m} lanes", "ratio"]
 ACTIONS = 256  # sampled before the clock starts
+ROUNDS = 8  # in which the packages take turns
 
 
 def original_classes() -> dict[str, type]:
@@ -84,10 +85,8 @@ def reset_rate(env, seconds: float) -> float:
     return resets / (time.process_time() - start)
 
 
-def measure(
-    id_: str, original: type | None, lanes: tuple[int, int], seconds: float, rounds: int = 8
-) -> dict[str, float]:
-    """The best rate of every measurement over the rounds, in which the packages take turns.
+def measure(id_: str, original: type | None, lanes: tuple[int, int], seconds: float) -> dict[str, float]:
+    """The best rate of every measurement over the rounds.
 
     lanes: of the vector environment, and of a larger one with vector observations.
     """
@@ -101,9 +100,9 @@ def measure(
         theirs = original()
         tasks[1:1] = [("their one", single_rate, theirs), ("their reset", reset_rate, theirs)]
     best: dict[str, float] = {}
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         for name, rate, env in tasks:
-            best[name] = max(best.get(name, 0.0), rate(env, seconds / rounds))
+            best[name] = max(best.get(name, 0.0), rate(env, seconds / ROUNDS))
     for _, _, env in tasks:
         env.close()
     return best

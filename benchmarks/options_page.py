@@ -6,7 +6,7 @@ python benchmarks/options_page.py > docs/options.md
 import json
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
@@ -80,12 +80,12 @@ def table(variants: Mapping[str, Variant]) -> str:
     return "\n".join(lines)
 
 
-def page() -> str:
-    """Return the page as Markdown."""
+def page(head: str, table: Callable[[Mapping[str, Variant]], str]) -> str:
+    """Return a page as Markdown, with a table for each family."""
     titles = [re.sub("(?<=[a-z])(?=[A-Z])", " ", family.__name__) for family in FAMILIES]
     tables = [f"## {name}\n\n{table(family.variants)}\n" for name, family in zip(titles, FAMILIES, strict=True)]
-    return "\n".join([HEAD, *tables])
+    return "\n".join([head, *tables])
 
 
 if __name__ == "__main__":
-    print(page(), end="")
+    print(page(HEAD, table), end="")

@@ -30,10 +30,10 @@ class Moment(NamedTuple):
     picture: np.ndarray  # the agent's view above the debug view, both VIEW pixels wide
 
 
-def joined(pictures: list[np.ndarray], axis: int, gap: int = GAP) -> np.ndarray:
+def joined(pictures: list[np.ndarray], axis: int) -> np.ndarray:
     """Join pictures of the same size along an axis, with white pixels in between."""
     shape = list(pictures[0].shape)
-    shape[axis] = gap
+    shape[axis] = GAP
     white = np.full(shape, 255, np.uint8)
     return np.concatenate([part for picture in pictures for part in (white, picture)][1:], axis)
 

@@ -35,15 +35,15 @@ class Bounds:
     scripted: float  # of a player that sees the whole state
 
 
-def read_bounds(path: Path = BOUNDS) -> dict[str, Bounds]:
+def read_bounds() -> dict[str, Bounds]:
     """Read what benchmarks/bounds.py wrote, by task."""
-    with path.open(newline="") as file:
+    with BOUNDS.open(newline="") as file:
         return {row["task"]: Bounds(float(row["random"]), float(row["scripted"])) for row in csv.DictReader(file)}
 
 
-def read_thesis(path: Path = THESIS) -> dict[str, str]:
+def read_thesis() -> dict[str, str]:
     """Read the interquartile means of GRU and TrXL that the thesis' text has, by task; a question mark for none."""
-    with path.open(newline="") as file:
+    with THESIS.open(newline="") as file:
         return {row["task"]: ", ".join(row[agent] or "?" for agent in ("GRU", "TrXL")) for row in csv.DictReader(file)}
 
 

@@ -3,16 +3,15 @@
 python benchmarks/vectors_page.py > docs/vectors.md
 """
 
-import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
-from memory_gym_envs import FAMILIES
 from memory_gym_envs.entries import Entries, vector_slices
 from memory_gym_envs.variant import Variant
+from options_page import page
 
 HEAD = """# Vector observations
 
@@ -59,12 +58,5 @@ def table(variants: Mapping[str, Variant]) -> str:
     return "\n".join(lines)
 
 
-def page() -> str:
-    """Return the page as Markdown."""
-    titles = [re.sub("(?<=[a-z])(?=[A-Z])", " ", family.__name__) for family in FAMILIES]
-    tables = [f"## {name}\n\n{table(family.variants)}\n" for name, family in zip(titles, FAMILIES, strict=True)]
-    return "\n".join([HEAD, *tables])
-
-
 if __name__ == "__main__":
-    print(page(), end="")
+    print(page(HEAD, table), end="")

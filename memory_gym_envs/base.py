@@ -270,8 +270,11 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             raise ValueError(f"this is no state of {self.variant_id}: {brief(state)}")
         # States of earlier versions are without these.
         state = {"_over": np.zeros(self.num_envs, bool), "made_with": self.arguments, **state}
-        self._check_state(state)
-        arrays, settings = restored(state["arrays"]), [self.complete_options(each) for each in state["settings"]]
+        try:
+            self._check_state(state)
+            arrays, settings = restored(state["arrays"]), [self.complete_options(each) for each in state["settings"]]
+        except (AttributeError, KeyError, TypeError) as error:
+            raise ValueError(f"this is no state of {self.variant_id}: {brief(error)}") from None
         super().set_state({**state, "settings": settings})
         self.configure(np.arange(self.num_envs))  # for what follows from the options of all lanes
         self.state = type(self.state)(**arrays)

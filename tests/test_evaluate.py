@@ -708,6 +708,7 @@ def test_a_result_has_what_tables_need():
         for name in evaluate.SECONDS.values():
             writer.add_scalar(name, 1.0, 10)
         for name in ("success", "return", "length", "num_fails", "other"):
+            writer.add_scalar(f"eval/{name}", 1.5, 10)
             writer.add_tensor(f"eval_levels/{name}", torch.tensor([[1.0, 2.0]]), 10)
     evaluate.write_run(evaluate.read_run("run"), "run.json.gz")
     kept = evaluate.read_run("run.json.gz").curves

@@ -376,7 +376,7 @@ def test_the_laptop_suite_has_budgets_of_its_own():
         config = learning.Config(suite=suite, tasks=(task,), agents=("GRU, Muon",), seeds=(1,))
         (plan,) = learning.plans_of(config).values()
         of_suites[suite] = plan.args.total_timesteps
-    assert of_suites == {"laptop": 3_000_000, "full": 6_000_000}
+    assert of_suites == {"laptop": 9_000_000, "full": 6_000_000}
 
 
 def test_a_run_goes_on_only_from_a_checkpoint(tmp_path, monkeypatch):

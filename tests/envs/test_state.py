@@ -156,6 +156,24 @@ def test_the_state_of_another_vector_environment(other):
     assert pickle.dumps(envs.get_state()) == before
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda state: state.pop("settings"), "this is no state of MysteryPath-v0: KeyError"),
+        (lambda state: state.update(arrays=None), "this is no state of MysteryPath-v0: AttributeError"),
+        (lambda state: state["arrays"].update(length=[1, 2, 3]), "this is no state of MysteryPath-v0: AttributeError"),
+    ],
+)
+def test_a_state_that_is_not_whole(change, message):
+    envs = gym.make_vec("MysteryPath-v0", num_envs=3)
+    envs.reset(seed=0)
+    before, state = pickle.dumps(envs.get_state()), envs.get_state()
+    change(state)
+    with pytest.raises(ValueError, match=message):
+        envs.set_state(state)
+    assert pickle.dumps(envs.get_state()) == before
+
+
 def test_what_is_no_state():
     env = gym.make("MysteryPath-v0").unwrapped
     env.reset(seed=0)
