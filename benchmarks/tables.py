@@ -42,9 +42,9 @@ def read_bounds() -> dict[str, Bounds]:
 
 
 def read_thesis() -> dict[str, str]:
-    """Read the interquartile means of GRU and TrXL that the thesis' text has, by task; a question mark for none."""
+    """Read the interquartile means of GRU and TrXL that the thesis' text has, by task."""
     with THESIS.open(newline="") as file:
-        return {row["task"]: ", ".join(row[agent] or "?" for agent in ("GRU", "TrXL")) for row in csv.DictReader(file)}
+        return {row["task"]: f"{row['GRU']}, {row['TrXL']}" for row in csv.DictReader(file)}
 
 
 def final_scores(name: str, runs: list[evaluate.RunLog]) -> np.ndarray:
