@@ -37,6 +37,7 @@ from ppo_utils.environments import (
     wrappers_of,
 )
 from ppo_utils.evaluation import first_unseen
+from ppo_utils.flags import bounded, check_bounds
 from ppo_utils.processes import RunError
 from ppo_utils.video import as_image, check_draws
 
@@ -100,7 +101,7 @@ class Config:
     """further ones, of agents that play the same task, to compare on the same levels"""
     seed: int | None = None
     """the level, and the seed of the actions (default: the first level after those of the training)"""
-    levels: int = 1
+    levels: bounded(int, 1, 100) = 1
     """levels to play, from this one on"""
     deterministic: bool = False
     """take the most probable actions instead of drawing them"""
@@ -108,7 +109,7 @@ class Config:
     """reset options of a Memory Gym environment as JSON, over those of the training"""
     out: str = "page.html"
     """the page to write"""
-    max_steps: int = 1000
+    max_steps: bounded(int, 1, 100_000) = 1000
     """where to stop an episode that does not end"""
 
 
@@ -399,9 +400,7 @@ def main(config: Config) -> str:
 
 def check(config: Config) -> None:
     """Raise ValueError or OSError for a flag that is out of range, or a page that cannot be written."""
-    for name, value, most in (("max-steps", config.max_steps, 100_000), ("levels", config.levels, 100)):
-        if not 1 <= value <= most:
-            raise ValueError(f"--{name} is {value}; it must be from 1 to {most}")
+    check_bounds(config)
     if config.seed is not None and not 0 <= config.seed <= 2**63 - config.levels:
         raise ValueError(f"--seed is {config.seed}; levels must be from 0 to 2 ** 63 - 1")
     if not Path(config.out).parent.is_dir() or Path(config.out).is_dir():

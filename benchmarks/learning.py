@@ -48,7 +48,7 @@ import evaluate
 import tables
 from ppo_utils.checkpoints import read_model
 from ppo_utils.evaluation import first_unseen
-from ppo_utils.flags import check_args, check_minibatches, flag
+from ppo_utils.flags import LARGEST, PositiveInt, bounded, check_args, check_bounds, check_minibatches
 from ppo_utils.runs import parse_args
 from suites import AGENTS, SUITES, TASKS, Task, short
 
@@ -61,15 +61,15 @@ FIRST_TEST_LEVEL = 1_000_000
 class Training:
     """How agents are trained, and where that goes."""
 
-    steps_scale: float = 1.0
+    steps_scale: bounded(float, 0, LARGEST, above=True) = 1.0
     """share of a task's steps to train for"""
     seeds: tuple[int, ...] = (1, 2, 3)
     """a training run each"""
-    jobs: int = os.cpu_count() or 1
+    jobs: PositiveInt = os.cpu_count() or 1
     """runs at the same time; they share the cores, or have OMP_NUM_THREADS threads each if that is set"""
-    evaluations: int = 20
+    evaluations: PositiveInt = 20
     """at least so many evaluations of a training, at even distances, and one at its end"""
-    test_levels: int = 1000
+    test_levels: PositiveInt = 1000
     """levels that the final weights play once, from FIRST_TEST_LEVEL on"""
     folder: Path = Path("learning")
     """where the runs go"""
@@ -125,11 +125,10 @@ class Plan:
 
 def check(config: Training) -> None:
     """Raise SystemExit for numbers that no training can have."""
-    for name in ("jobs", "evaluations", "test_levels"):
-        if getattr(config, name) < 1:
-            raise SystemExit(f"{flag(name)} is {getattr(config, name)}; it must be 1 or more")
-    if not 0 < config.steps_scale < math.inf:
-        raise SystemExit(f"--steps-scale is {config.steps_scale}; it must be a number above 0")
+    try:
+        check_bounds(config)
+    except ValueError as error:
+        raise SystemExit(str(error)) from None
     if not config.seeds or len(set(config.seeds)) < len(config.seeds):
         raise SystemExit(f"--seeds is {' '.join(map(str, config.seeds)) or 'empty'}; give at least one, and each once")
 

@@ -31,6 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other pac
 
 import evaluate
 from ppo_utils.checkpoints import checkpoints_in, save_checkpoint
+from ppo_utils.flags import NonNegativeFloat, NonNegativeInt, PositiveInt, check_bounds
 from ppo_utils.runs import close, parse_args
 
 FLAGS = "--preset laptop --env-id MysteryPath-Grid-v0 --num-envs 4 --num-steps 32 --num-minibatches 2 --no-cuda"
@@ -42,13 +43,13 @@ class Config:
 
     script: Literal["ppo_gru", "ppo_trxl"] = "ppo_gru"
     """which of the two"""
-    kills: int = 100
+    kills: NonNegativeInt = 100
     """how often to kill"""
-    seconds: float = 4.0
+    seconds: NonNegativeFloat = 4.0
     """longest life of a process that is killed"""
-    iterations: int = 30
+    iterations: PositiveInt = 30
     """length of a run that is killed"""
-    soak: int = 200
+    soak: NonNegativeInt = 200
     """length of the run that is watched, in iterations"""
     cost: bool = True
     """time checkpoints too"""
@@ -169,9 +170,7 @@ def cost(config: Config) -> None:
 
 def main(config: Config) -> None:
     """Do all that is asked for, in a temporary folder. Raises ValueError for numbers that cannot work."""
-    for name, low in (("kills", 0), ("seconds", 0), ("iterations", 1), ("soak", 0)):
-        if getattr(config, name) < low:
-            raise ValueError(f"--{name} is {getattr(config, name)}; it must be {low} or more")
+    check_bounds(config)
     torch.set_num_threads(1)  # forks must not inherit threads
     importlib.import_module("torch._dynamo")  # by the optimizer; else every fork spends most of its life on it
     with tempfile.TemporaryDirectory() as folder:
