@@ -191,12 +191,12 @@ def overview(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds], thesis:
         known = bounds.get(name)
         cells = [
             f"{name}, {TASKS[name].score}",
-            f"{int(first.args['total_timesteps']) / 1e6:g} M",
+            f"{int(first.args['total_timesteps']) / 1e6:.3g} M",
             f"{known.random:.2f}" if known else "",
             *(cell(TASKS[name], agents.get(agent, [])) for agent in names),
             f"{known.scripted:.2f}" if known else "",
             *[thesis.get(name, "") for _ in theirs],
-            f"{min(minutes):.0f} to {max(minutes):.0f}",
+            " to ".join(dict.fromkeys(f"{each:.0f}" for each in (min(minutes), max(minutes)))),
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
