@@ -147,7 +147,7 @@ FULL = {  # trained for what two cores can do in a day, all agents and seeds tog
 LAPTOP = {
     env_id: replace(FULL[env_id], total_timesteps=int(1_000_000 * millions))
     for env_id, millions in {
-        "MortarMayhem-v0": 6,
+        "MortarMayhem-v0": 12,
         "MortarMayhem-Grid-v0": 6,
         "MortarMayhemB-Grid-v0": 6,
         "Endless-MortarMayhem-v0": 9,
