@@ -48,7 +48,7 @@ import evaluate
 import tables
 from ppo_utils.checkpoints import read_model
 from ppo_utils.evaluation import first_unseen
-from ppo_utils.flags import LARGEST, PositiveInt, bounded, check_args, check_bounds, check_minibatches
+from ppo_utils.flags import PositiveInt, bounded, check_args, check_bounds, check_minibatches
 from ppo_utils.runs import parse_args
 from suites import AGENTS, SUITES, TASKS, Task, short
 
@@ -61,7 +61,7 @@ FIRST_TEST_LEVEL = 1_000_000
 class Training:
     """How agents are trained, and where that goes."""
 
-    steps_scale: bounded(float, 0, LARGEST, above=True) = 1.0
+    steps_scale: bounded(float, 0, 1000, above=True) = 1.0
     """share of a task's steps to train for"""
     seeds: tuple[int, ...] = (1, 2, 3)
     """a training run each"""

@@ -191,7 +191,7 @@ def overview(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds], thesis:
         known = bounds.get(name)
         cells = [
             f"{name}, {TASKS[name].score}",
-            f"{int(first.args['total_timesteps']) / 1e6:.3g} M",
+            f"{int(first.args['total_timesteps']) / 1e6:.4g} M",
             f"{known.random:.2f}" if known else "",
             *(cell(TASKS[name], agents.get(agent, [])) for agent in names),
             f"{known.scripted:.2f}" if known else "",

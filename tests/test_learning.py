@@ -62,8 +62,9 @@ def test_an_agent_may_have_further_flags(tmp_path):
         ({"jobs": 0}, "--jobs is 0; it must be 1 or more"),
         ({"evaluations": 0}, "--evaluations is 0; it must be 1 or more"),
         ({"test_levels": 0}, "--test-levels is 0; it must be 1 or more"),
-        ({"steps_scale": 0}, "--steps-scale is 0; it must be above 0"),
-        ({"steps_scale": float("nan")}, "--steps-scale is nan; it must be above 0"),
+        ({"steps_scale": 0}, "--steps-scale is 0; it must be above 0 and at most 1000"),
+        ({"steps_scale": float("nan")}, "--steps-scale is nan; it must be above 0 and at most 1000"),
+        ({"steps_scale": float("inf")}, "--steps-scale is inf; it must be above 0 and at most 1000"),
     ],
 )
 def test_numbers_that_no_training_can_have(wrong, message):
