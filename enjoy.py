@@ -26,19 +26,12 @@ import torch
 import tyro
 from torch import Tensor, nn
 
-from ppo_utils.checkpoints import import_script, load_weights, make_agent, read_model, saved_args
-from ppo_utils.environments import (
-    as_tensors,
-    envs_for,
-    final_numbers,
-    ground_truths,
-    is_memory_gym,
-    with_options,
-    wrappers_of,
-)
-from ppo_utils.evaluation import first_unseen
+from ppo_utils.checkpoints import import_script, load_weights, read_model, saved_args
+from ppo_utils.environments import as_tensors, envs_for, is_memory_gym, with_options, wrappers_of
+from ppo_utils.errors import RunError
+from ppo_utils.evaluation import first_unseen, make_agent
 from ppo_utils.flags import bounded, check_bounds
-from ppo_utils.processes import RunError
+from ppo_utils.infos import final_numbers, ground_truths
 from ppo_utils.video import as_image, check_draws
 
 try:

@@ -43,11 +43,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.util.tensor_util import make_ndarray
 from tqdm import tqdm
 
-from ppo_utils.checkpoints import RENAMED, import_script, load_weights, make_agent, read_model, saved_args
+from ppo_utils.checkpoints import RENAMED, import_script, load_weights, read_model, saved_args
 from ppo_utils.environments import envs_for, with_options
-from ppo_utils.evaluation import are_trained_on, evaluate, evaluation_levels, first_unseen
+from ppo_utils.errors import RunError
+from ppo_utils.evaluation import are_trained_on, evaluate, evaluation_levels, first_unseen, make_agent
 from ppo_utils.flags import NonNegativeInt, PositiveInt, check_bounds
-from ppo_utils.processes import RunError
 
 try:
     from matplotlib import color_sequences, rc_context

@@ -45,12 +45,14 @@ from torch import Tensor, nn
 from torch.distributions import Categorical
 from torch.nn.utils.rnn import pad_sequence
 
-from ppo_utils.checkpoints import make_agent
-from ppo_utils.environments import add_ended, as_tensors, final_observations, ground_truth_of, training_envs
+from ppo_utils.environments import as_tensors, training_envs
+from ppo_utils.evaluation import make_agent
 from ppo_utils.fast import encode, first_occurrences, in_chunks
 from ppo_utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, UnitInterval, bounded
+from ppo_utils.infos import add_ended, final_observations, ground_truth_of
 from ppo_utils.processes import all_gather, average_gradients
-from ppo_utils.runs import Run, command, end_iteration, open_run, prepare, report_out_of_memory, run_to_end
+from ppo_utils.run import Run
+from ppo_utils.runs import command, end_iteration, open_run, prepare, report_out_of_memory, run_to_end
 
 
 # ---- 1 ARGS ----

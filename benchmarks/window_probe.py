@@ -17,10 +17,11 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from ppo_utils.errors import RunError
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
 
 import evaluate
-from ppo_utils.processes import RunError
 
 
 @dataclass

@@ -6,11 +6,15 @@
     observations   observations as images and vectors
     wrappers       what can be observed too: stacks, the step, the last action, Fourier features, spotlights
     video          videos of the first environment
+    infos          what a training counts and logs of their infos
     evaluation     scores on levels that are not trained on
     acting         a trained agent in a program of one's own
-    runs           run folder, logs, progress bar, signals, command line
+    run            what a training run consists of
+    runs           a training from its command line to its end: run folder, signals
+    logs           TensorBoard, progress bar, Weights and Biases
     checkpoints    models and checkpoints: written, read, resumed
     processes      several processes that train one agent
+    errors         what ends a training, in one line
     fast           what computes the same faster on a CPU
 
 No module here names a script; `checkpoints.import_script` imports the one that wrote a file.

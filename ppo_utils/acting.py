@@ -8,9 +8,9 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array
 
-from ppo_utils.checkpoints import import_script, load_weights, make_agent, read_model, saved_args
+from ppo_utils.checkpoints import import_script, load_weights, read_model, saved_args
 from ppo_utils.environments import as_tensors, env_actions, envs_for, wrap_envs, wrappers_of
-from ppo_utils.evaluation import MEMORY_STEPS, act
+from ppo_utils.evaluation import MEMORY_STEPS, act, make_agent
 from ppo_utils.lanes import check_fits
 
 

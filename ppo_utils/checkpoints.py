@@ -17,20 +17,17 @@ from collections.abc import Callable
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
-import gymnasium as gym
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ppo_utils.environments import ground_truth_of, load_state, save_state
+from ppo_utils.environments import load_state, save_state
 from ppo_utils.evaluation import are_trained_on, first_unseen
 from ppo_utils.flags import as_flags, flag
 from ppo_utils.processes import all_gather, rank_and_size
-
-if TYPE_CHECKING:
-    from ppo_utils.runs import Run
+from ppo_utils.run import Run
 
 T = TypeVar("T")  # a script's Args
 # Names that flags and weights have in older files.
@@ -184,16 +181,6 @@ def import_script(saved: dict[str, Any], path: str | Path) -> ModuleType:
     if not hasattr(script, "Args"):
         raise ValueError(f"{path} was trained by {name}.py, which is not here; run this beside that script")
     return script
-
-
-def make_agent(kind: type[nn.Module], envs: gym.vector.VectorEnv, infos: dict, args: Any) -> nn.Module:
-    """Make an agent, of a script's Agent, for environments; infos are those of a reset.
-
-    Raises ValueError for spaces that do not suit, RunError if there is no ground truth to estimate.
-    """
-    truth = ground_truth_of(infos, args)
-    size = 0 if truth is None else truth.shape[1]
-    return kind(envs.single_observation_space, envs.single_action_space.nvec.tolist(), args, size)
 
 
 def load_weights(agent: nn.Module, saved: dict[str, Any], path: str | Path) -> None:

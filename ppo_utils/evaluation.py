@@ -3,6 +3,8 @@
 Shape letters: N environments, one for each episode.
 """
 
+import functools
+import sys
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,8 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
-from ppo_utils.environments import as_tensors, final_numbers
+from ppo_utils.environments import as_tensors
+from ppo_utils.infos import final_numbers, ground_truth_of
 
 REPEATS = 3  # times that each level is played
 MEMORY_STEPS = 64  # that a memory has room for, until `begin_rollout` makes room again
@@ -30,6 +33,16 @@ def evaluation_levels(args: Any, levels: int, repeats: int = REPEATS, first: int
     """Return the seeds (N,) of an evaluation's levels, with repeats: from `first`, or from the first unseen one."""
     first = first_unseen(args) if first is None else first
     return [level for level in range(first, first + levels) for _ in range(repeats)]
+
+
+def make_agent(kind: type[nn.Module], envs: VectorEnv, infos: dict, args: Any) -> nn.Module:
+    """Make an agent, of a script's Agent, for environments; infos are those of a reset.
+
+    Raises ValueError for spaces that do not suit, RunError if there is no ground truth to estimate.
+    """
+    truth = ground_truth_of(infos, args)
+    size = 0 if truth is None else truth.shape[1]
+    return kind(envs.single_observation_space, envs.single_action_space.nvec.tolist(), args, size)
 
 
 def act(agent: nn.Module, obs: dict[str, Tensor], state: Any, step: int, deterministic: bool) -> Tensor:
@@ -85,3 +98,28 @@ def evaluate(
             if not playing.any():
                 break
     return metrics | {"finished": 1.0 - playing}
+
+
+def level_scores(args: Any, agent: nn.Module, envs: VectorEnv) -> dict[str, Tensor]:
+    """Return an evaluation's metrics by name, (--eval-levels, REPEATS) float64: every episode on every level.
+
+    Training goes on as if there had been none, unless an environment of another package takes random numbers from
+    NumPy's or Python's global generator. A metric is left out if some episodes lack it: what is reported only at an
+    episode's end is missing where --eval-max-steps cut the episode short.
+    """
+    device = next(agent.parameters()).device
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        torch.manual_seed(args.seed)
+        levels = evaluation_levels(args, args.eval_levels)
+        metrics = evaluate(agent, envs, levels, args.eval_max_steps, amp=args.amp)
+    incomplete = [name for name, values in metrics.items() if np.isnan(values).any()]
+    for name in incomplete:
+        tell_incomplete(name)
+    complete = {name: torch.from_numpy(values) for name, values in metrics.items() if name not in incomplete}
+    return {name: values.unflatten(0, (-1, REPEATS)) for name, values in complete.items()}
+
+
+@functools.cache
+def tell_incomplete(name: str) -> None:
+    """Say, once, that evaluations leave a metric out."""
+    print(f"\nevaluations leave out {name}: not all of their episodes report it", file=sys.stderr)

@@ -20,7 +20,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from gymnasium.vector.async_vector_env import AsyncState, _async_worker
 
 from memory_gym_envs.options import brief
-from ppo_utils.processes import RunError
+from ppo_utils.errors import LaneError, RunError
 
 OWN = "own"  # where an info has a lane's own info, and its `Place`
 
@@ -52,10 +52,6 @@ class Place(NamedTuple):
 
 class UnfitError(ValueError):
     """An observation or a reward is not what it should be."""
-
-
-class LaneError(RuntimeError):
-    """What an environment raised, and which environment it was."""
 
 
 class Lane(gym.Wrapper):

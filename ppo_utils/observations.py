@@ -15,8 +15,8 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
 from memory_gym_envs.base import lane_seeds
 from memory_gym_envs.options import brief
+from ppo_utils.errors import RunError
 from ppo_utils.lanes import OWN, Place
-from ppo_utils.processes import RunError
 from ppo_utils.wrappers import OBSERVATION, one_hot, rows_of
 
 SMALLEST_IMAGE = 36  # pixels along a side; what is smaller becomes a vector

@@ -4,20 +4,16 @@ They make the same update, since their gradients are averaged; the first one eva
 """
 
 import contextlib
-from collections import defaultdict
 from collections.abc import Iterator
 from datetime import timedelta
 from typing import Any
 
-import numpy as np
 import torch
 import torch.distributed as dist
 import torch.distributed.nn  # imported before the group is made: see `join_processes`
 from torch import nn
 
-
-class RunError(RuntimeError):
-    """Training cannot go on for a reason outside of it, such as a full disk; the message is one line that names it."""
+from ppo_utils.errors import RunError
 
 
 def join_processes() -> None:
@@ -73,18 +69,3 @@ def average_gradients(agent: nn.Module, num_steps: int) -> None:
     means = (flat[:-1] / flat[-1]).split([gradient.numel() for gradient in gradients])
     for gradient, mean in zip(gradients, means, strict=True):
         gradient.copy_(mean.view_as(gradient))  # in place: its memory layout has to stay that of the weight
-
-
-def combine_logs(parts: list[tuple[dict, dict]]) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """Return the means of what the processes logged, of losses/ratio_error the maximum, and the episodes of all."""
-    logs, episodes = zip(*parts, strict=True)
-    values_of = {name: [each[name] for each in logs if name in each] for name in logs[0]}
-    combined = {
-        name: float(np.max(values) if name == "losses/ratio_error" else np.mean(values))
-        for name, values in values_of.items()
-    }
-    joined = defaultdict(list)
-    for each in episodes:
-        for name, values in each.items():
-            joined[name] += values
-    return combined, joined

@@ -1,4 +1,4 @@
-"""Run folder, logs, progress bar, signals and the command line of a training.
+"""A training from its command line to its end: set-up, run folder, what ends an iteration, signals.
 
 A script's `setup` calls `prepare`, makes its agent, and ends with `open_run`; its `train` calls `end_iteration` after
 each iteration. `run_to_end` calls `train`; `command` calls `setup`, then `run_to_end`.
@@ -7,7 +7,6 @@ each iteration. `run_to_end` calls `train`; `command` calls `setup`, then `run_t
 import argparse
 import contextlib
 import fcntl
-import functools
 import math
 import os
 import random
@@ -17,21 +16,17 @@ import signal
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import fields
 from itertools import count
 from pathlib import Path
-from typing import IO, Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import gymnasium as gym
 import numpy as np
 import torch
 import torch.distributed as dist
 import tyro
-from torch import nn
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
 from ppo_utils.checkpoints import (
     SCRIPT_NAME,
@@ -47,44 +42,15 @@ from ppo_utils.checkpoints import (
     write_file,
 )
 from ppo_utils.environments import envs_for
-from ppo_utils.evaluation import REPEATS, evaluate, evaluation_levels
+from ppo_utils.errors import LaneError, RunError
+from ppo_utils.evaluation import REPEATS, level_scores
 from ppo_utils.flags import as_flags, check_args, check_minibatches, flag
-from ppo_utils.lanes import LaneError
-from ppo_utils.processes import (
-    RunError,
-    all_gather,
-    combine_logs,
-    join_processes,
-    leave_processes,
-    rank_and_size,
-)
+from ppo_utils.logs import combine_logs, open_logs, start_tracking, write_logs
+from ppo_utils.processes import all_gather, join_processes, leave_processes, rank_and_size
+from ppo_utils.run import Run
 from ppo_utils.video import LaneVideo, check_can_film, check_draws
 
 T = TypeVar("T")  # a script's Args
-
-
-@dataclass
-class Run:
-    """All that training needs, made by a script's `setup`."""
-
-    script: str  # the name of the script
-    envs: gym.vector.VectorEnv
-    agent: nn.Module
-    optimizers: list[torch.optim.Optimizer]
-    rollout: Any  # a script's Rollout
-    folder: Path = Path()  # named by `open_run`
-    eval_envs: gym.vector.VectorEnv | None = None
-    lock: IO | None = None  # a locked file, which tells other processes that the folder is in use
-    writer: SummaryWriter | None = None  # in the first process only, like the progress bar
-    bar: tqdm | None = None
-    iteration: int = 0  # the current one, from 1
-    step: int = 0  # so far, of all environments together
-    seconds: float = 0.0  # of training, without evaluations
-    returns: deque = field(default_factory=lambda: deque(maxlen=100))  # of the last episodes, for the progress bar
-    lengths: deque = field(default_factory=lambda: deque(maxlen=100))
-    received_signal: int = 0  # number of the signal (SIGINT or SIGTERM) that this process got, or 0
-    stop: bool = False  # a process got one: this iteration is the last
-    scores: dict[str, torch.Tensor] = field(default_factory=dict)  # of the last evaluation, see `level_scores`
 
 
 # ---- setting up ----
@@ -237,33 +203,6 @@ def make_folder(args: Any) -> Path:
                 raise OSError(f"cannot make {folder} ({error.strerror}); {where}") from None
 
 
-def open_logs(args: Any, run: Run) -> None:
-    """Open a TensorBoard file, which hides older entries beyond the run's step, and the progress bar."""
-    run.writer = SummaryWriter(str(run.folder), purge_step=run.step + 1 if run.step else None)
-    hyperparameters = {"script": run.script, **asdict(args)}
-    rows = "\n".join(f"|{key}|{' '.join(str(value).split())}|" for key, value in hyperparameters.items())
-    run.writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}", run.step)
-    batch_size = args.num_envs * args.num_steps
-    total = args.total_timesteps // batch_size * batch_size
-    run.bar = tqdm(total=total, initial=run.step, unit=" steps", unit_scale=True)
-
-
-def start_tracking(args: Any, name: str) -> None:
-    """Mirror the TensorBoard curves to Weights and Biases; its environment variables name the project and the team.
-
-    Raises ValueError if that does not start, ImportError without the extra `track`.
-    """
-    try:
-        import wandb
-    except ImportError:
-        raise ImportError('--track needs wandb: pip install -e ".[track]"') from None
-    how = {"resume": "allow", "reinit": "finish_previous", "sync_tensorboard": True, "save_code": True}
-    try:
-        wandb.init(name=name, id=name, config=asdict(args), **how)
-    except Exception as error:  # whatever wandb raises: no account, no such team, no network
-        raise ValueError(f"--track: {error}; log in with `wandb login`, or leave --track out") from None
-
-
 # ---- while it trains ----
 @contextlib.contextmanager
 def report_failed_write(folder: Path) -> Iterator[None]:
@@ -283,7 +222,7 @@ def end_iteration(args: Any, run: Run, logs: dict[str, float], episodes: dict[st
     iterations = args.total_timesteps // (args.num_envs * args.num_steps)
     is_last = run.iteration == iterations
     evaluates = run.eval_envs is not None and (run.iteration % args.eval_interval == 0 or is_last)
-    run.scores = level_scores(args, run) if evaluates else {}
+    run.scores = level_scores(args, run.agent, run.eval_envs) if evaluates else {}
     logs |= {f"eval/{name}": values.mean().item() for name, values in run.scores.items()}
     run.stop = any(all_gather(run.received_signal))
     logs, episodes = combine_logs(all_gather((logs, episodes)))
@@ -293,53 +232,6 @@ def end_iteration(args: Any, run: Run, logs: dict[str, float], episodes: dict[st
             run.writer.add_tensor(f"eval_levels/{name}", values, run.step)
         if args.checkpoint_interval and (run.iteration % args.checkpoint_interval == 0 or is_last or run.stop):
             save_checkpoint(args, run)
-
-
-def level_scores(args: Any, run: Run) -> dict[str, torch.Tensor]:
-    """Return an evaluation's metrics by name, (--eval-levels, REPEATS) float64: every episode on every level.
-
-    Training goes on as if there had been none, unless an environment of another package takes random numbers from
-    NumPy's or Python's global generator. A metric is left out if some episodes lack it: what is reported only at an
-    episode's end is missing where --eval-max-steps cut the episode short.
-    """
-    device = run.rollout.values.device
-    with torch.random.fork_rng([device] if device.type == "cuda" else []):
-        torch.manual_seed(args.seed)
-        levels = evaluation_levels(args, args.eval_levels)
-        metrics = evaluate(run.agent, run.eval_envs, levels, args.eval_max_steps, amp=args.amp)
-    incomplete = [name for name, values in metrics.items() if np.isnan(values).any()]
-    for name in incomplete:
-        tell_incomplete(name)
-    complete = {name: torch.from_numpy(values) for name, values in metrics.items() if name not in incomplete}
-    return {name: values.unflatten(0, (-1, REPEATS)) for name, values in complete.items()}
-
-
-@functools.cache
-def tell_incomplete(name: str) -> None:
-    """Say, once, that evaluations leave a metric out."""
-    print(f"\nevaluations leave out {name}: not all of their episodes report it", file=sys.stderr)
-
-
-def write_logs(args: Any, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
-    """Write an iteration's numbers to TensorBoard and the progress bar; the first process does."""
-    run.seconds += logs["charts/seconds_iteration"]
-    run.returns.extend(episodes.get("charts/episodic_return", []))
-    run.lengths.extend(episodes.get("charts/episodic_length", []))
-    if run.writer is None:
-        return
-    ended = len(episodes.get("charts/episodic_return", []))
-    for name, values in episodes.items():
-        logs[name] = float(np.mean(values))
-        if len(values) < ended:  # a metric that not all of them report
-            logs[f"{name}_count"] = len(values)
-    logs["charts/SPS"] = run.step / run.seconds
-    for name, value in logs.items():
-        run.writer.add_scalar(name, value, run.step)
-    last = {"return": run.returns, "length": run.lengths}
-    shown = {name: f"{np.mean(values):.2f}" for name, values in last.items() if values}
-    with contextlib.suppress(OSError):  # where the bar is shown may be gone, and the training goes on
-        run.bar.set_postfix({**shown, "SPS": f"{logs['charts/SPS']:.0f}"}, refresh=False)
-        run.bar.update(args.num_envs * args.num_steps)
 
 
 def stop_on_signals(run: Run) -> None:

@@ -15,8 +15,8 @@ import ppo_trxl
 from ppo_utils import acting, evaluation
 from ppo_utils.acting import Player
 from ppo_utils.environments import envs_for
+from ppo_utils.errors import RunError
 from ppo_utils.evaluation import evaluate
-from ppo_utils.processes import RunError
 
 EVERYTHING = {"frame_stack": 3, "step_encoding": True, "observe_last_action": True}
 NESTED = shows(

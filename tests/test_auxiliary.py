@@ -14,7 +14,7 @@ import ppo_trxl
 from ppo_gru import Agent, Args, Decoder
 from ppo_utils.checkpoints import read_model
 from ppo_utils.environments import envs_for
-from ppo_utils.processes import RunError
+from ppo_utils.errors import RunError
 
 HEADS = {"reconstruction_coef": 0.1, "ground_truth_coef": 0.1}
 SCRIPTS = pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])

@@ -19,10 +19,10 @@ from conftest import SCRIPTS, parse_args
 import ppo_gru
 import ppo_trxl
 from ppo_utils import runs
-from ppo_utils.checkpoints import make_agent
 from ppo_utils.environments import envs_for
+from ppo_utils.errors import RunError
+from ppo_utils.evaluation import make_agent
 from ppo_utils.flags import check_args, check_minibatches
-from ppo_utils.processes import RunError
 
 SCRIPT = os.path.abspath(ppo_gru.__file__)
 CASES = {

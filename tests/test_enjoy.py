@@ -31,9 +31,8 @@ import ppo_gru
 import ppo_trxl
 from memory_gym_envs.character import PAD
 from memory_gym_envs.mystery_path.state import ROWS
-from ppo_utils.checkpoints import make_agent
 from ppo_utils.environments import as_tensors, envs_for, is_memory_gym
-from ppo_utils.evaluation import act
+from ppo_utils.evaluation import act, make_agent
 
 AGENTS = {
     "GRU": (ppo_gru, {"env_id": "MysteryPath-Grid-v0", "reconstruction_coef": 0.1, "ground_truth_coef": 0.1}),

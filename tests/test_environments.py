@@ -17,14 +17,8 @@ from gymnasium.vector import AutoresetMode
 from memory_gym_envs import IDS, MortarMayhem
 from memory_gym_envs.drawing import gray
 from ppo_utils import video
-from ppo_utils.environments import (
-    final_numbers,
-    final_observations,
-    find_spec,
-    is_memory_gym,
-    make_envs,
-    parse_options,
-)
+from ppo_utils.environments import find_spec, is_memory_gym, make_envs, parse_options
+from ppo_utils.infos import final_numbers, final_observations
 from ppo_utils.observations import Part
 from ppo_utils.video import LaneVideo, check_can_film
 

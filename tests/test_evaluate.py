@@ -23,8 +23,9 @@ import memory_gym_envs
 import ppo_gru
 import ppo_trxl
 from ppo_utils import evaluation
-from ppo_utils.checkpoints import load_weights, make_agent, read_model, saved_args
+from ppo_utils.checkpoints import load_weights, read_model, saved_args
 from ppo_utils.environments import envs_for
+from ppo_utils.evaluation import make_agent
 
 TASK = {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "num_levels": 10, "start_level": 5, "save_model": True}
 FEW = {"levels": 4, "repeats": 2, "cuda": False}

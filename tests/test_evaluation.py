@@ -10,7 +10,7 @@ from conftest import SCRIPTS
 
 import ppo_gru
 import ppo_trxl
-from ppo_utils import evaluation, runs
+from ppo_utils import evaluation
 from ppo_utils.environments import envs_for
 from ppo_utils.evaluation import evaluate, evaluation_levels
 
@@ -142,7 +142,7 @@ def test_what_is_logged_of_an_evaluation(tiny, curves, monkeypatch):
     """Levels by repeats, and the mean; what some episode did not report is left out."""
     numbers = np.arange(6.0)
     told = {"return": numbers, "steps": numbers, "success": np.where(numbers == 4, np.nan, numbers)}
-    monkeypatch.setattr(runs, "evaluate", lambda *_, **__: told)
+    monkeypatch.setattr(evaluation, "evaluate", lambda *_, **__: told)
     found = curves(ppo_gru.main(tiny(env_id="CueRecall-v0", eval_interval=2, **FEW)))
     assert found["eval/return"] == [(128, 2.5)]
     assert found["eval_levels/return"] == [(128, [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])]

@@ -20,10 +20,11 @@ from test_environments import box, register, roll
 import ppo_gru
 from ppo_utils import environments, evaluation, runs
 from ppo_utils.checkpoints import read_model
-from ppo_utils.environments import env_actions, envs_for, final_numbers, find_spec, ground_truth_of, make_envs
-from ppo_utils.lanes import LaneError, Levels, make_lane
+from ppo_utils.environments import env_actions, envs_for, find_spec, make_envs
+from ppo_utils.errors import LaneError, RunError
+from ppo_utils.infos import final_numbers, ground_truth_of, tell_left_out
+from ppo_utils.lanes import Levels, make_lane
 from ppo_utils.observations import Part, WrongValue
-from ppo_utils.processes import RunError
 from ppo_utils.video import LaneVideo, as_image, even, video_writer
 
 EACH_SCRIPT = pytest.mark.parametrize("script", SCRIPTS)
@@ -79,7 +80,7 @@ NO_NUMBERS = [None, "text", np.zeros(2), [1, 2], {"a": 1}, float("nan"), 10**400
 @pytest.mark.parametrize("order", [1, -1, 3], ids=["as they are", "backwards", "rotated"])
 def test_a_metric_is_what_each_lane_said(order, capfd):
     """Gymnasium makes an array of the first lane's type, in which 0.5 after 0 is 0, and 3 after False is True."""
-    environments.tell_left_out.cache_clear()
+    tell_left_out.cache_clear()
     kinds = [*KINDS, *NO_NUMBERS]
     kinds = kinds[order:] + kinds[:order] if order > 1 else kinds[::order]
     env_id = small(count=itertools.count(), tell=lambda env: {"score": kinds[env.number]} if env.ended else {})
@@ -121,7 +122,7 @@ def test_over_how_many_episodes_a_mean_is(tiny, script, scalars):
 
 
 def test_evaluations_say_which_metric_they_leave_out(tiny, capfd, scalars):
-    runs.tell_incomplete.cache_clear()
+    evaluation.tell_incomplete.cache_clear()
     tell = lambda env: {"success": 1.0} if env.ended and env.number % 2 else {}  # noqa: E731
     args = tiny(env_id=small(count=itertools.count(), tell=tell), eval_interval=1, eval_levels=2)
     found = scalars(ppo_gru.main(args))

@@ -20,6 +20,7 @@ import ppo_gru
 import ppo_trxl
 from ppo_utils import environments, processes
 from ppo_utils.checkpoints import read_checkpoint, read_model
+from ppo_utils.logs import combine_logs
 
 SCRIPTS = [ppo_gru, ppo_trxl]
 GRID = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector"}
@@ -145,7 +146,7 @@ def test_processes_play_shares_of_the_lanes_of_one(tiny, monkeypatch):
 
 def test_a_maximum_is_the_maximum_of_all_processes():
     logs = [{"losses/ratio_error": 40.0, "losses/loss": 1.0}, {"losses/ratio_error": 100.0, "losses/loss": 2.0}]
-    combined, episodes = processes.combine_logs([(logs[0], {"a": [1.0]}), (logs[1], {"a": [2.0], "b": [3.0]})])
+    combined, episodes = combine_logs([(logs[0], {"a": [1.0]}), (logs[1], {"a": [2.0], "b": [3.0]})])
     assert combined == {"losses/ratio_error": 100.0, "losses/loss": 1.5}
     assert episodes == {"a": [1.0, 2.0], "b": [3.0]}
 

@@ -27,7 +27,7 @@ import ppo_gru
 import ppo_trxl
 from ppo_utils import checkpoints, runs
 from ppo_utils.checkpoints import model_of, read_checkpoint, read_model, write_file
-from ppo_utils.processes import RunError
+from ppo_utils.errors import RunError
 
 GRID = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector"}
 ENDLESS = {"env_id": "Endless-SearingSpotlights-v0", "obs_type": "vector"}
