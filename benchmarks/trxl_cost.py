@@ -8,7 +8,6 @@ memory alone, as the agent plays, once its window is full; the attention's is me
 """
 
 import os
-import resource
 import statistics
 import sys
 import tempfile
@@ -64,7 +63,9 @@ def kept_for_backward(run, args: ppo_trxl.Args) -> list[torch.Tensor]:
 
 
 def shares(config: Config) -> None:
-    """Print the resident memory after an iteration, and the memory's own share."""
+    """Print the resident memory after an iteration, on Linux, and the memory's own share."""
+    import resource  # which Windows does not have
+
     steps = {"num_steps": config.num_steps, "total_timesteps": 32 * config.num_steps}
     args = ppo_trxl.Args(env_id=config.env_id, cuda=False, **steps)
     run = ppo_trxl.setup(args)

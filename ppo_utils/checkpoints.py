@@ -58,7 +58,8 @@ def save_checkpoint(args: Any, run: Run) -> None:
         return
     run.writer.flush()  # a checkpoint means that the curves are there too
     for path in run.folder.glob("events.*"):
-        with path.open("rb") as file:
+        # For Windows it has to be open for writing. A file that may not be written has not changed.
+        with contextlib.suppress(PermissionError), path.open("rb+") as file:
             os.fsync(file.fileno())
     saved = {"seconds": run.seconds, "returns": list(run.returns), "lengths": list(run.lengths)}
     saved["optimizers"] = [optimizer.state_dict() for optimizer in run.optimizers]

@@ -8,6 +8,7 @@ import copy
 import functools
 import inspect
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -202,7 +203,10 @@ def work_apart(*arguments: Any) -> None:
     Signals to the training's process group, such as Ctrl-C or that of `timeout`, are for the first process: it ends the
     iteration, for which it needs all lanes, and then the lanes.
     """
-    os.setsid()
+    if hasattr(os, "setsid"):
+        os.setsid()
+    else:  # Windows, where Ctrl-C is for all processes of a console
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     _async_worker(*arguments)
 
 

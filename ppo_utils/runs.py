@@ -6,7 +6,6 @@ each iteration. `run_to_end` calls `train`; `command` calls `setup`, then `run_t
 
 import argparse
 import contextlib
-import fcntl
 import math
 import os
 import random
@@ -22,6 +21,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+import filelock
 import gymnasium as gym
 import numpy as np
 import torch
@@ -167,11 +167,11 @@ def open_folder(args: Any, run: Run) -> None:
         raise OSError(f"--resume {run.folder}: this folder cannot be written")
     run.lock = (run.folder / ".lock").open("w")
     try:
-        fcntl.flock(run.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until the file is closed
-    except BlockingIOError:
-        raise OSError(f"--resume {run.folder}: another process is training this run") from None
+        locked = filelock.lock_descriptor(run.lock.fileno(), blocking=False)  # until the file is closed
     except OSError:  # some network file systems have no locks
-        pass
+        locked = True
+    if not locked:
+        raise OSError(f"--resume {run.folder}: another process is training this run")
     if args.resume is not None and checkpoints_in(run.folder)[-1].stem != f"checkpoint-{run.step}":
         raise OSError(f"--resume {run.folder}: another process has just gone on with this run; start again")
     if args.track:
@@ -179,6 +179,7 @@ def open_folder(args: Any, run: Run) -> None:
             start_tracking(args, run.folder.resolve().name)
         except (ValueError, ImportError):
             if args.resume is None:
+                run.lock.close()  # Windows removes no file that is open
                 (run.folder / ".lock").unlink()
                 os.removedirs(run.folder)
             raise
@@ -190,8 +191,8 @@ def open_folder(args: Any, run: Run) -> None:
 
 def make_folder(args: Any) -> Path:
     """Make a run folder; runs of the same name that begin in the same second get a number. Raises OSError."""
-    env_id = args.env_id.replace("/", "-").replace(":", "-")
-    first = Path("runs") / f"{env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
+    name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
+    first = Path("runs") / re.sub(r'[<>:"/\\|?*\x00-\x1f]', "-", name)  # what a name may not have in Windows
     for number in count(1):
         folder = first if number == 1 else first.with_name(f"{first.name}-{number}")
         try:
@@ -297,7 +298,7 @@ def summary(args: Any, run: Run) -> str:
         score = f"return {run.scores['return'].mean():.2f} on {args.eval_levels} unseen levels"
     elif run.returns:
         score = f"return {np.mean(run.returns):.2f}, mean of the last {len(run.returns)} episodes"
-    folder = shlex.quote(str(run.folder))
+    folder = shlex.quote(run.folder.as_posix())  # with slashes, which need no quotes, in Windows too
     # A wheel has these modules in this package, and the scripts at top level.
     installed = Path(__file__).with_name("evaluate.py").exists()
     evaluate, enjoy = ("-m ppo_utils.evaluate", "-m ppo_utils.enjoy") if installed else ("evaluate.py", "enjoy.py")
@@ -306,11 +307,12 @@ def summary(args: Any, run: Run) -> str:
     checkpoints = checkpoints_in(run.folder)[-1:]
     if run.stop and checkpoints:
         lines.append(f"resume: python {script} --resume {folder}")
-    for model in [run.folder / "model.pt"] if args.save_model else checkpoints:
-        lines.append(f"evaluate: python {evaluate} {shlex.quote(str(model))}")
+    for path in [run.folder / "model.pt"] if args.save_model else checkpoints:
+        model = shlex.quote(path.as_posix())
+        lines.append(f"evaluate: python {evaluate} {model}")
         with contextlib.suppress(ValueError):
             check_draws("enjoy.py", args.env_id)
-            lines.append(f"watch: python {enjoy} {shlex.quote(str(model))} --out page.html")
+            lines.append(f"watch: python {enjoy} {model} --out page.html")
     return "\n".join([*lines, f"plot: tensorboard --logdir {folder}"])
 
 

@@ -1,6 +1,7 @@
 """Bad input ends in one line that says what is wrong and what would be right, and writes nothing."""
 
 import errno
+import fcntl
 import glob
 import os
 import re
@@ -147,7 +148,7 @@ def test_a_file_system_without_locks(tiny, opened, monkeypatch, number):
     def flock(*_):
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(runs.fcntl, "flock", flock)
+    monkeypatch.setattr(fcntl, "flock", flock)  # of what filelock calls here
     assert opened(ppo_gru, tiny(env_id="CueRecall-v0")).folder.is_dir()
 
 
