@@ -43,7 +43,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.util.tensor_util import make_ndarray
 from tqdm import tqdm
 
-from ppo_utils.checkpoints import RENAMED, import_script, load_weights, read_model, saved_args
+from ppo_utils.checkpoints import FORMER_DEFAULTS, RENAMED, import_script, load_weights, read_model, saved_args
 from ppo_utils.environments import envs_for, with_options
 from ppo_utils.errors import RunError
 from ppo_utils.evaluation import are_trained_on, evaluate, evaluation_levels, first_unseen, make_agent
@@ -397,15 +397,16 @@ def hyperparameters(events: EventAccumulator) -> dict[str, str]:
 def with_defaults(given: dict[str, str]) -> dict[str, str]:
     """Return a run's arguments as today's version has them.
 
-    An argument that is newer than the run has its default, one that no longer exists is left out.
+    An argument that is newer than the run has the value that it stood for then, or its default; one that no longer
+    exists is left out.
     """
     name = given.get("script", "ppo_trxl" if "trxl_dim" in given else "ppo_gru")  # an older run does not say it
     try:
         defaults = asdict(import_script({"script": name}, name).Args())
     except ValueError:  # the script is not here
         defaults = given
-    given = {RENAMED.get(key, key): value for key, value in given.items()}
-    return {"script": name} | {key: given.get(key, str(value)) for key, value in defaults.items()}
+    given = FORMER_DEFAULTS | {RENAMED.get(key, key): value for key, value in given.items()}
+    return {"script": name} | {key: str(given.get(key, value)) for key, value in defaults.items()}
 
 
 def write_run(run: RunLog, path: str) -> None:

@@ -203,7 +203,6 @@ TABLES = (
             "query-position-gru": in_endless(
                 GRU, (QUERY_POSITION, f"{QUERY_POSITION} --trxl-dim 96"), text="(7.1.3) still behind GRU"
             ),
-            "query-output": in_endless(TRXL, ("TrXL --trxl-query-output",), text="(7.1.3) is catastrophic"),
             "stale": in_endless(("TrXL, refreshed",), TRXL, text="(7.1.4) refreshed memory helps"),
             "encodings": in_endless(
                 tuple(f"TrXL --trxl-positional-encoding {kind}" for kind in ("learned", "relative")),

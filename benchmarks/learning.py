@@ -53,7 +53,8 @@ from ppo_utils.runs import parse_args
 from suites import AGENTS, SUITES, TASKS, Task, short
 
 ROOT = Path(__file__).parent.parent
-COMMON = "--preset laptop --save-model"
+# The results were trained when 1 was the default of --value-init-gain. An agent's own flags override these.
+COMMON = "--preset laptop --save-model --value-init-gain 1"
 FIRST_TEST_LEVEL = 1_000_000
 
 

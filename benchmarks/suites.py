@@ -20,7 +20,7 @@ MEMORIES = {
 }
 # The thesis' exploration bonus, with the weights that suit it on these tasks; the preset has the log barrier.
 ENTROPY = "--exploration-bonus entropy --init-ent-coef 1e-3 --final-ent-coef 1e-4"
-MUON = {  # --preset laptop
+MUON = {  # --preset laptop, with --value-init-gain 1 as all agents (learning.COMMON)
     "no memory, Muon": "ppo_gru.py --memory none",
     "stack of 16, Muon": "ppo_gru.py --memory none --frame-stack 16",
     "GRU, Muon": "ppo_gru.py",

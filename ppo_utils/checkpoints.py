@@ -37,6 +37,8 @@ RENAMED_WEIGHTS = {
     ".norm_output.": ".norm_projection.",
     ".merge_output.": ".merge_projection.",
 }
+# What a flag stood for in files that are older than it, where its default is another one now.
+FORMER_DEFAULTS = {"value_init_gain": 1.0}
 CHECKPOINTS_KEPT = 2
 SCRIPT_NAME = r"ppo_\w+"  # of what a file may import
 
@@ -160,9 +162,13 @@ def read_model(path: str | Path) -> dict[str, Any]:
 
 
 def saved_args(kind: type[T], saved: dict[str, Any]) -> T:
-    """Return the arguments, of a script's Args, in what `read_model` read; a flag that is newer has its default."""
+    """Return the arguments, of a script's Args, in what `read_model` read.
+
+    A flag that is newer has the value that it stood for before it was one, or its default; one that no longer exists is
+    left out.
+    """
     known = {each.name for each in fields(kind)}
-    return kind(**{name: value for name, value in saved["args"].items() if name in known})
+    return kind(**{name: value for name, value in (FORMER_DEFAULTS | saved["args"]).items() if name in known})
 
 
 def import_script(saved: dict[str, Any], path: str | Path) -> ModuleType:

@@ -402,3 +402,14 @@ def test_only_the_agents_to_draw_are_drawn(tmp_path, monkeypatch):
     config = learning.Config(suite="laptop", tasks=(task,), draw=("GRU, Muon",), report=True)
     learning.main(replace(config, results=ROOT / "benchmarks/results"))
     assert [*drawn[task]] == ["GRU, Muon"]
+
+
+@pytest.mark.parametrize("agent", ["GRU", "TrXL, Muon", "ppo_gru.py --preset thesis", "GRU --value-init-gain 0.01"])
+def test_the_first_values_are_those_of_the_results(agent):
+    """These were trained when --value-init-gain 1 was the default, or without that flag, as it was before."""
+    plan = learning.plan(learning.Config(), learning.TASKS["mortar-mayhem"], agent, 1)
+    assert "--value-init-gain 1" in " ".join(plan.command)
+    assert plan.args.value_init_gain == (0.01 if "0.01" in agent else 1.0)
+    older = {name: text for name, text in plan.logged_args().items() if name != "value_init_gain"}
+    if "0.01" not in agent:
+        assert evaluate.with_defaults(older) == plan.logged_args()
