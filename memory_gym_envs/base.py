@@ -8,7 +8,7 @@ observation.
 
 import math
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -19,8 +19,9 @@ from gymnasium.vector.utils import batch_space
 
 from memory_gym_envs.drawing import gray, magnify
 from memory_gym_envs.entries import vector_space
+from memory_gym_envs.old_gymnasium import warn_of_wrappers
 from memory_gym_envs.options import brief, complete_options
-from memory_gym_envs.saving import Saved, plain, restored
+from memory_gym_envs.saving import Saved, is_generator, plain, restored
 from memory_gym_envs.state import grows
 from memory_gym_envs.variant import Variant
 
@@ -30,6 +31,16 @@ DEBUG_ZOOM = 4  # the debug view is 336 x 336
 ALL = slice(None)  # every lane
 NO_LIMIT = np.iinfo(np.int64).max  # of steps
 LEVEL_STREAM = 1  # keeps the generator that chooses levels apart from the one that builds them
+# What a subclass has to define.
+OF_A_FAMILY = ("variants", "spaces", "allocate", "begin", "advance", "vectors", "frames", "ground_truth", "summary")
+# Of what a saved state has for each lane: what it must be.
+LANE_BY_LANE: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "settings": ("reset options", lambda each: isinstance(each, dict)),
+    "_rngs": ("states of generators or None", lambda each: each is None or is_generator(each)),
+    "_level_rngs": ("states of generators or None", lambda each: each is None or is_generator(each)),
+    "_seeds": ("integers or None", lambda each: each is None or isinstance(each, int)),
+    "_over": ("True or False", lambda each: isinstance(each, (bool, np.bool_))),
+}
 
 
 class MemoryGymVectorEnv(Saved, VectorEnv):
@@ -83,6 +94,9 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         max_episode_steps: int | None = None,
     ):
+        missing = [name for name in OF_A_FAMILY if getattr(type(self), name) is getattr(MemoryGymVectorEnv, name)]
+        if missing:
+            raise TypeError(f"gym.make_vec(id) makes an environment: {type(self).__name__} lacks {', '.join(missing)}")
         if variant not in self.variants:
             raise ValueError(f"variant must be one of {', '.join(self.variants)}, not {variant!r}")
         if render_mode is not None and render_mode not in RENDER_MODES:
@@ -185,6 +199,8 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
 
         Raises ValueError for a wrong seed or option; nothing has changed then.
         """
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            warn_of_wrappers()
         lanes, options = self._split_mask(options)
         seeds = lane_seeds(seed, self.num_envs)
         self.restart(lanes, seeds, self.complete_options(options))
@@ -272,10 +288,11 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         state = {"_over": np.zeros(self.num_envs, bool), "made_with": self.arguments, **state}
         try:
             self._check_state(state)
-            arrays, settings = restored(state["arrays"]), [self.complete_options(each) for each in state["settings"]]
+            settings = [self.complete_options(each) for each in state["settings"]]
+            arrays, kept = restored(state["arrays"]), {name: restored(state[name]) for name in self.kept}
         except (AttributeError, KeyError, TypeError) as error:
             raise ValueError(f"this is no state of {self.variant_id}: {brief(error)}") from None
-        super().set_state({**state, "settings": settings})
+        super().set_state({**kept, "settings": settings})
         self.configure(np.arange(self.num_envs))  # for what follows from the options of all lanes
         self.state = type(self.state)(**arrays)
         self.place_tables()
@@ -288,16 +305,29 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
                 raise ValueError(
                     f"the saved state is of one with {name} {theirs.get(name)!r}, not {self.arguments.get(name)!r}"
                 )
-        arrays = state["arrays"]
+        for name in self.kept:
+            given, ours = state[name], plain(getattr(self, name))
+            if type(given) is not type(ours) or getattr(given, "dtype", None) != getattr(ours, "dtype", None):
+                raise ValueError(f"its {name} must be like {brief(ours)}, not {brief(given)}")
+        for name, (what, is_right) in LANE_BY_LANE.items():
+            if len(state[name]) != self.num_envs:
+                raise ValueError(f"its {name} are of {len(state[name])} lanes, not of {self.num_envs}")
+            for each in state[name]:
+                if not is_right(each):
+                    raise ValueError(f"its {name} must be {what}, not {brief(each)}")
+        self._check_arrays(state["arrays"])
+
+    def _check_arrays(self, arrays: dict[str, np.ndarray]) -> None:
+        """Raises ValueError if these arrays do not fit into the state."""
         if arrays.keys() != vars(self.state).keys():
             raise ValueError(f"the saved state is of another version of {self.variant_id}")
         for name, ours in vars(self.state).items():
             fixed, shape = slice(ours.ndim - grows(self.state, name)), arrays[name].shape
             if len(shape) != ours.ndim or shape[fixed] != ours.shape[fixed]:
                 raise ValueError(f"its array {name} has the shape {shape}, not {ours.shape}")
-        for name in ("settings", "_rngs", "_level_rngs", "_seeds", "_over"):
-            if len(state[name]) != self.num_envs:
-                raise ValueError(f"its {name} are of {len(state[name])} lanes, not of {self.num_envs}")
+            # Some arrays are of another type of integers after a step.
+            if arrays[name].dtype.kind.replace("u", "i") != ours.dtype.kind.replace("u", "i"):
+                raise ValueError(f"its array {name} is of {arrays[name].dtype}, not of {ours.dtype}")
 
     def complete_options(self, options: Mapping[str, Any] | None) -> dict[str, Any]:
         """The complete reset options. Raises ValueError for a wrong one."""

@@ -9,6 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from memory_gym_envs.options import brief
+
 BIT_GENERATORS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")  # NumPy's
 
 
@@ -43,14 +45,22 @@ def plain(value: Any) -> Any:
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
+def is_generator(value: Any) -> bool:
+    """Whether the value is what plain() makes of a generator."""
+    return isinstance(value, dict) and "bit_generator" in value
+
+
 def restored(value: Any) -> Any:
-    """A copy of what plain() returned, with its generators. Raises ValueError for one that NumPy does not have."""
-    if isinstance(value, dict) and "bit_generator" in value:
+    """A copy of what plain() returned, with its generators. Raises ValueError for one that is none of NumPy's."""
+    if is_generator(value):
         kind = value["bit_generator"]
         if kind not in BIT_GENERATORS:
             raise ValueError(f"the saved state has a generator of an unknown kind, {kind!r}")
         rng = np.random.Generator(getattr(np.random, kind)(0))
-        rng.bit_generator.state = value
+        try:
+            rng.bit_generator.state = value
+        except (IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
+            raise ValueError(f"the saved state has a generator that is no {kind}: {brief(error)}") from None
         return rng
     if isinstance(value, dict):
         return {name: restored(each) for name, each in value.items()}

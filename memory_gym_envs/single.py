@@ -33,6 +33,8 @@ class MemoryGymEnv(gym.Env):
         obs_type: str = "pixels",
         options: Mapping[str, Any] | None = None,
     ):
+        if not hasattr(self, "family"):
+            raise TypeError(f"gym.make(id) makes an environment: {type(self).__name__} lacks family")
         self.batch = self.family(variant, 1, render_mode, num_levels, start_level, obs_type, options)
         self.render_mode = render_mode
         self.metadata = {**type(self).metadata, "render_fps": self.batch.metadata["render_fps"]}
@@ -122,8 +124,10 @@ class MemoryGymEnv(gym.Env):
                     theirs = self.batch.complete_options(theirs)
                 if theirs != ours[name]:
                     raise ValueError(f"it is of one with {name} {brief(theirs)}, not {brief(ours[name])}")
+            if not isinstance(state["needs_reset"], bool):
+                raise ValueError(f"its needs_reset must be True or False, not {brief(state['needs_reset'])}")
             self.batch.set_state(state["batch"])
-            self._needs_reset = bool(state["needs_reset"])
+            self._needs_reset = state["needs_reset"]
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             self.batch.set_state(before)
             what = error if isinstance(error, ValueError) else brief(error)

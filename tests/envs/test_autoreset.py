@@ -1,5 +1,8 @@
 """Other autoreset modes than same-step, and a limit of steps: as Gymnasium's own vector environment does it."""
 
+import re
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -8,6 +11,8 @@ from gymnasium.wrappers import vector as wrappers
 from helpers import EACH, EACH_OBS, HASTY, check_same, make, roll
 from players import FAMILY
 from test_lanes import CHANGED, LANES, OPTIONS, Told, check_resets_and_steps, mixed_actions, reset_both
+
+from memory_gym_envs.old_gymnasium import warn_of
 
 NEXT, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED
 
@@ -78,6 +83,61 @@ def test_what_gymnasium_wraps():
     assert ends
     for info in ends:
         assert np.array_equal(info["episode"]["l"][info["_episode"]], info["length"][info["_episode"]])
+
+
+WRONG_BEFORE_1_4 = pytest.mark.parametrize(
+    ("wrapper", "words"),
+    [
+        (wrappers.RecordEpisodeStatistics, "leaves out the first step .* Use Gymnasium 1.4 or later, or .*NEXT_STEP"),
+        (wrappers.NormalizeReward, "adds up rewards beyond the end of an episode. Use Gymnasium 1.4 or later"),
+    ],
+)
+
+
+@pytest.fixture
+def old_gymnasium(monkeypatch):
+    """Let memory_gym_envs take this Gymnasium for an older one, of which it has not warned yet."""
+    monkeypatch.setattr(gym, "__version__", "1.3.0")
+    warn_of.cache_clear()
+    yield
+    warn_of.cache_clear()
+
+
+def warnings_of(reset):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        reset(seed=0)
+    return [str(each.message) for each in caught]
+
+
+@WRONG_BEFORE_1_4
+def test_old_wrappers_are_told(wrapper, words, old_gymnasium):
+    """Once in a process, wherever among others the wrapper is; and nobody else is told."""
+    envs = make("MysteryPath-v0")
+    for fine in (envs, wrappers.ClipReward(envs, 0, 1), wrapper(make("MysteryPath-v0", autoreset_mode=NEXT))):
+        assert warnings_of(fine.reset) == []
+    wrapped = wrappers.ClipReward(type("Own", (wrapper,), {})(wrappers.ClipReward(envs, 0, 1)), 0, 1)
+    (told,) = warnings_of(wrapped.reset)
+    assert re.search(
+        f"vector.{wrapper.__name__} of Gymnasium 1.3.0 is wrong with same-step autoreset: it {words}", told
+    )
+    assert warnings_of(wrapped.reset) == []
+
+
+@WRONG_BEFORE_1_4
+def test_wrappers_of_this_version_are_right_or_told(wrapper, words):
+    """Four steps of reward 1 an episode: their number, and the discounted return from 1 on in each."""
+    warn_of.cache_clear()
+    envs = wrapper(make("MysteryPath-v0", options={"max_steps": 4, "reward_step": 1.0, "reward_path_progress": 0.0}))
+    told, lengths, returns = warnings_of(envs.reset), [], []
+    for step in range(1, 13):
+        infos = envs.step(np.zeros((4, 2), int))[-1]
+        if step % 4:
+            returns += getattr(envs, "accumulated_reward", np.array([])).tolist()
+        lengths += [*infos.get("episode", {}).get("l", [])]
+    right = set(lengths) <= {4} and set(np.round(returns, 4)) <= {1, 1.99, 2.9701}
+    assert lengths or returns
+    assert right != bool(told)
 
 
 @EACH

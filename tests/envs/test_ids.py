@@ -11,7 +11,7 @@ from helpers import EACH, check_same
 from players import FAMILY
 
 import memory_gym_envs
-from memory_gym_envs import MemoryGymEnv
+from memory_gym_envs import MemoryGymEnv, MemoryGymVectorEnv, MysteryPath
 
 OTHERS = """
 import gymnasium as gym
@@ -59,6 +59,24 @@ def test_docstring_and_signature(env_id):
         assert "| 0 " in text
     names = [*inspect.signature(type(env)).parameters]
     assert names == ["variant", "render_mode", "num_levels", "start_level", "obs_type", "options"]
+
+
+EVERYTHING = "variants, spaces, allocate, begin, advance, vectors, frames, ground_truth, summary"
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (MemoryGymEnv, r"gym.make\(id\) makes an environment: MemoryGymEnv lacks family"),
+        (type("Single", (MemoryGymEnv,), {}), "Single lacks family"),
+        (MemoryGymVectorEnv, rf"gym.make_vec\(id\) makes an environment: MemoryGymVectorEnv lacks {EVERYTHING}$"),
+        (type("Half", (MemoryGymVectorEnv,), {"variants": MysteryPath.variants}), "Half lacks spaces, allocate, begin"),
+    ],
+)
+def test_classes_of_no_environment(kind, message):
+    with pytest.raises(TypeError, match=message) as error:
+        kind("MysteryPath-v0")
+    assert "\n" not in str(error.value)
 
 
 def test_wrong_argument_of_a_single_environment():

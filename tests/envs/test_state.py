@@ -162,16 +162,63 @@ def test_the_state_of_another_vector_environment(other):
         (lambda state: state.pop("settings"), "this is no state of MysteryPath-v0: KeyError"),
         (lambda state: state.update(arrays=None), "this is no state of MysteryPath-v0: AttributeError"),
         (lambda state: state["arrays"].update(length=[1, 2, 3]), "this is no state of MysteryPath-v0: AttributeError"),
+        (lambda state: state["arrays"].update(pos=np.zeros((3, 2))), "its array pos is of float64, not of int64"),
+        (lambda state: state.update(ready=1), "its ready must be like True, not 1"),
+        (lambda state: state.update(_over=np.zeros(3)), "its _over must be like .*False.*, not array"),
+        (lambda state: state.update(_seeds=[1, 2.0, 3]), "its _seeds must be integers or None, not 2.0"),
+        (lambda state: state.update(settings=[{}, None, {}]), "its settings must be reset options, not None"),
     ],
 )
 def test_a_state_that_is_not_whole(change, message):
-    envs = gym.make_vec("MysteryPath-v0", num_envs=3)
+    envs = gym.make_vec("MysteryPath-v0", num_envs=3, num_levels=5)
     envs.reset(seed=0)
-    before, state = pickle.dumps(envs.get_state()), envs.get_state()
+    state = envs.get_state()
     change(state)
-    with pytest.raises(ValueError, match=message):
+    check_unchanged(envs, state, message)
+
+
+def check_unchanged(envs, state, message):
+    """One line says what is wrong with the vector environment's state, and it goes on as it was."""
+    before = pickle.dumps(envs.get_state())
+    with pytest.raises(ValueError, match=message) as error:
         envs.set_state(state)
+    assert "\n" not in str(error.value)
     assert pickle.dumps(envs.get_state()) == before
+
+
+PCG = np.random.PCG64(0).state
+
+
+@pytest.mark.parametrize("name", ["_rngs", "_level_rngs"])
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (5, "must be states of generators or None, not 5"),
+        ("PCG64", "must be states of generators or None, not 'PCG64'"),
+        ({"state": PCG["state"]}, "must be states of generators or None, not {'state'"),
+        (np.random.default_rng(0), "must be states of generators or None, not Generator"),
+        ({**PCG, "bit_generator": "PCG65"}, "a generator of an unknown kind, 'PCG65'"),
+        ({"bit_generator": "PCG64"}, "a generator that is no PCG64: KeyError"),
+        ({**PCG, "state": None}, "a generator that is no PCG64: TypeError"),
+        ({**PCG, "state": {"state": -1, "inc": 1}}, "a generator that is no PCG64: OverflowError"),
+        ({**PCG, "bit_generator": "SFC64"}, "a generator that is no SFC64: "),
+        ({"bit_generator": "MT19937", "state": {"key": [1], "pos": 0}}, "a generator that is no MT19937: IndexError"),
+    ],
+)
+def test_generators_that_are_none(name, wrong, message):
+    """Of the last lane: the others must not be taken over, either."""
+    envs, env = gym.make_vec("MysteryPath-v0", num_envs=3, num_levels=5), gym.make("MysteryPath-v0").unwrapped
+    envs.reset(seed=0)
+    roll(envs, 3)
+    other = gym.make_vec("MysteryPath-v0", num_envs=3, num_levels=5)
+    other.reset(seed=7)
+    state = other.get_state()
+    state[name][2] = wrong
+    check_unchanged(envs, state, message)
+    env.reset(seed=0)
+    state = env.get_state()
+    state["batch"][name][0] = wrong
+    check_refused(env, state, message)
 
 
 def test_what_is_no_state():
@@ -179,6 +226,7 @@ def test_what_is_no_state():
     env.reset(seed=0)
     check_refused(env, None, "TypeError")
     check_refused(env, {}, "KeyError('made_with')")
+    check_refused(env, {**env.get_state(), "needs_reset": "no"}, "its needs_reset must be True or False, not 'no'")
     for change, message in (
         ({"settings": [{"arena_size": 3}]}, "MysteryPath-v0 has no option 'arena_size'"),
         ({"settings": [{"max_steps": -2}]}, "option 'max_steps' must be"),
