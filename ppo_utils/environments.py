@@ -125,8 +125,13 @@ def make_envs(
         kwargs = {"num_levels": num_levels, "start_level": start_level, "obs_type": obs_type, "options": options}
     if render_mode is not None:
         kwargs["render_mode"] = render_mode if memory_gym else "rgb_array"
+    levels = Levels(start_level, num_levels)
+    if seed is not None:
+        # Neighbouring seeds must not share lanes, so the lanes' seeds count up from a hash of the seed, of 30 bits,
+        # since some simulators take seeds below 2 ** 31 only.
+        seed = int(np.random.SeedSequence(seed).generate_state(1)[0] >> 2) + first_lane
     with one_line_errors(f"{env_id} cannot be made"):
-        envs = same_step_envs(spec, num_envs, kwargs, first_lane, Levels(start_level, num_levels), asynchronous)
+        envs = same_step_envs(spec, num_envs, kwargs, first_lane, levels, asynchronous, seed)
 
     try:
         envs = wrap_envs(envs, first_lane, **wrappers)
@@ -136,9 +141,7 @@ def make_envs(
 
         if seed is not None:
             with one_line_errors(f"{env_id} cannot be reset"):
-                # Neighbouring seeds must not share lanes, so the lanes' seeds count up from a hash of the seed, of 30
-                # bits, since some simulators take seeds below 2 ** 31 only.
-                envs.reset(seed=int(np.random.SeedSequence(seed).generate_state(1)[0] >> 2) + first_lane)
+                envs.reset(seed=seed)
         # An explicit seed is a level of its own, which nobody plays: what counts episodes comes after it.
         return EpisodeStatistics(envs)
     except Exception:

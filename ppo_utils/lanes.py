@@ -8,10 +8,14 @@ import copy
 import functools
 import inspect
 import os
+import secrets
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from multiprocessing import Queue
+from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -22,6 +26,7 @@ from gymnasium.vector.async_vector_env import AsyncState, _async_worker
 
 from memory_gym_envs.options import brief
 from ppo_utils.errors import LaneError, RunError
+from ppo_utils.processes import seed_generators
 
 OWN = "own"  # where an info has a lane's own info, and its `Place`
 
@@ -131,13 +136,24 @@ class Lane(gym.Wrapper):
 
 
 class AsyncLanes(AsyncVectorEnv):
-    """Lanes in processes of their own. One that dies is a RunError; after an error, closing waits for none of them."""
+    """Lanes in processes of their own. One that dies is a RunError; after an error, closing waits for none of them.
 
-    def __init__(self, lanes: list[Callable[[], gym.Env]], first_lane: int):
+    seed: of the first lane, the others' follow; see `work_apart`.
+    """
+
+    def __init__(self, lanes: list[Callable[[], gym.Env]], first_lane: int, seed: int | None):
         self._first_lane = first_lane  # the number of the first one, among those of all processes
         self._pending = False  # a call has begun, and has not come to its end
+        worker = functools.partial(work_apart, first_lane, seed)
         # Not all spaces can be in shared memory.
-        super().__init__(lanes, autoreset_mode=AutoresetMode.SAME_STEP, shared_memory=False, worker=work_apart)
+        apart = {"autoreset_mode": AutoresetMode.SAME_STEP, "shared_memory": False, "worker": worker}
+        try:
+            with self._alive():
+                super().__init__(lanes, **apart)
+        except BaseException:
+            for process in getattr(self, "processes", ()):
+                process.terminate()
+            raise
 
     def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
         """Reset all lanes."""
@@ -162,7 +178,7 @@ class AsyncLanes(AsyncVectorEnv):
             yield
             self._pending = False
         except (EOFError, ConnectionError) as error:
-            for lane, process in enumerate(self.processes, self._first_lane):
+            for lane, process in enumerate(getattr(self, "processes", ()), self._first_lane):
                 process.join(1)
                 if process.exitcode is not None:
                     code = process.exitcode
@@ -171,9 +187,17 @@ class AsyncLanes(AsyncVectorEnv):
 
 
 def same_step_envs(
-    spec: EnvSpec, num_envs: int, kwargs: dict[str, Any], first_lane: int, levels: Levels, asynchronous: bool
+    spec: EnvSpec,
+    num_envs: int,
+    kwargs: dict[str, Any],
+    first_lane: int,
+    levels: Levels,
+    asynchronous: bool,
+    seed: int | None,
 ) -> VectorEnv:
     """Make the id's own vector environment if it resets in the same step, else lanes one after the other, or at once.
+
+    seed: that the first lane will be reset with.
 
     Raises ValueError if there is no environment that resets in the same step, and for kwargs that it does not take.
     """
@@ -190,15 +214,25 @@ def same_step_envs(
     make = functools.partial(make_lane, spec, kwargs, levels)
     lanes = [functools.partial(make, first_lane + lane) for lane in range(num_envs)]
     if asynchronous:
-        envs = AsyncLanes(lanes, first_lane)
+        envs = AsyncLanes(lanes, first_lane, seed)
     else:
         envs = SyncVectorEnv(lanes, autoreset_mode=AutoresetMode.SAME_STEP)
     envs.spec = spec
     return envs
 
 
-def work_apart(*arguments: Any) -> None:
-    """Step a lane as Gymnasium does, in a session of its own.
+def work_apart(
+    first_lane: int,
+    seed: int | None,
+    index: int,
+    make: Callable[[], gym.Env],
+    pipe: Connection,
+    parent_pipe: Connection,
+    shared_memory: Any,
+    errors: Queue,
+    *more: Any,
+) -> None:
+    """Step a lane as Gymnasium does, in a session of its own, with global generators that are seeded like the lane.
 
     Signals to the training's process group, such as Ctrl-C or that of `timeout`, are for the first process: it ends the
     iteration, for which it needs all lanes, and then the lanes.
@@ -207,7 +241,35 @@ def work_apart(*arguments: Any) -> None:
         os.setsid()
     else:  # Windows, where Ctrl-C is for all processes of a console
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _async_worker(*arguments)
+    # Else they would be copies of the training's: an environment that draws from them would be the same in all lanes.
+    seed_generators(secrets.randbits(32) if seed is None else seed + index)
+    errors = LaneErrors(errors, first_lane + index)
+    try:
+        env = make()
+    except Exception as error:
+        parent_pipe.close()
+        what = f"environment {first_lane + index} raised {type(error).__name__} when it was made"
+        errors.put((index, LaneError, ": ".join(filter(None, [what, one_line(error)])), traceback.format_exc()))
+        pipe.recv()  # the first call
+        pipe.send((None, False))
+        return
+    _async_worker(index, lambda: env, pipe, parent_pipe, shared_memory, errors, *more)
+
+
+class LaneErrors:
+    """Takes the errors of a lane's process to the training, each as one line that names the lane."""
+
+    def __init__(self, queue: Queue, number: int):
+        self._queue, self._number = queue, number
+
+    def put(self, item: tuple[int, type[BaseException], Any, str]) -> None:
+        """Send the lane's index, an error's type and value, and its traceback."""
+        index, kind, value, trace = item
+        message = str(value)
+        if issubclass(kind, Exception) and not issubclass(kind, (LaneError, RunError)):  # not raised by a `Lane`
+            hint = "what it returns has to be sent from its process; train without --async-envs"
+            kind, message = RunError, f"environment {self._number}: {kind.__name__}: {one_line(value)}; {hint}"
+        self._queue.put((index, kind, message, trace))
 
 
 def make_lane(spec: EnvSpec, kwargs: dict[str, Any], levels: Levels, number: int) -> Lane:

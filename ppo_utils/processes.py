@@ -4,10 +4,12 @@ They make the same update, since their gradients are averaged; the first one eva
 """
 
 import contextlib
+import random
 from collections.abc import Iterator
 from datetime import timedelta
 from typing import Any
 
+import numpy as np
 import torch
 import torch.distributed as dist
 import torch.distributed.nn  # imported before the group is made: see `join_processes`
@@ -28,6 +30,13 @@ def leave_processes() -> None:
     """Close the connection to the other processes."""
     if dist.is_initialized():
         dist.destroy_process_group()
+
+
+def seed_generators(seed: int) -> None:
+    """Seed torch's generator, and NumPy's and Python's, which environments of other packages may use."""
+    random.seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002
+    torch.manual_seed(seed)
 
 
 def rank_and_size() -> tuple[int, int]:

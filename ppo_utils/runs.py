@@ -8,7 +8,6 @@ import argparse
 import contextlib
 import math
 import os
-import random
 import re
 import shlex
 import signal
@@ -46,7 +45,7 @@ from ppo_utils.errors import LaneError, RunError
 from ppo_utils.evaluation import REPEATS, level_scores
 from ppo_utils.flags import as_flags, check_args, check_minibatches, flag
 from ppo_utils.logs import combine_logs, open_logs, start_tracking, write_logs
-from ppo_utils.processes import all_gather, join_processes, leave_processes, rank_and_size
+from ppo_utils.processes import all_gather, join_processes, leave_processes, rank_and_size, seed_generators
 from ppo_utils.run import Run
 from ppo_utils.video import LaneVideo, check_can_film, check_draws
 
@@ -89,7 +88,7 @@ def prepare(args: Any, script: str, longest_piece: int) -> tuple[torch.device, d
     check_minibatches(args, longest_piece)
     if args.capture_video:
         check_can_film(args.env_id)
-    seed_generators(args.seed)
+    seed_process(args, checkpoint)
     torch.backends.cudnn.deterministic = args.torch_deterministic
     if not (torch.cuda.is_available() and args.cuda):
         return torch.device("cpu"), checkpoint
@@ -97,11 +96,17 @@ def prepare(args: Any, script: str, longest_piece: int) -> tuple[torch.device, d
     return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0))), checkpoint
 
 
-def seed_generators(seed: int) -> None:
-    """Seed torch's generator, and NumPy's and Python's, which environments of other packages may use."""
-    random.seed(seed)
-    np.random.seed(seed % 2**32)  # noqa: NPY002
-    torch.manual_seed(seed)
+def seed_process(args: Any, checkpoint: dict[str, Any] | None) -> None:
+    """Seed torch's generator, for the weights, and those of NumPy and Python, for environments of other packages.
+
+    All processes begin with the same weights. Environments of another process, and those of a run that goes on, which
+    begin new episodes, must not repeat the episodes that the first process began with.
+    """
+    seed_generators(args.seed)
+    if (rank := rank_and_size()[0]) or checkpoint is not None:
+        entropy = [args.seed, rank, 0 if checkpoint is None else checkpoint["step"]]
+        seed_generators(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
+        torch.manual_seed(args.seed)
 
 
 @contextlib.contextmanager
@@ -141,8 +146,8 @@ def open_run(args: Any, run: Run, checkpoint: dict[str, Any] | None) -> Run:
     if args.eval_interval and rank == 0:
         with report_out_of_memory(args, torch.device("cpu")):
             run.eval_envs = envs_for(args, args.eval_levels * REPEATS, asynchronous=False)
-    if rank > 0:  # all processes began with the same weights, but draw numbers of their own
-        seed_generators(int(np.random.SeedSequence([args.seed, rank]).generate_state(1)[0]))
+    if rank > 0:  # all processes began with the same weights, but draw actions of their own
+        torch.manual_seed(int(np.random.SeedSequence([args.seed, rank]).generate_state(1)[0]))
     if args.load_model is not None and checkpoint is None:
         load_model(args, run.agent, run.script)
     if checkpoint is not None:

@@ -4,9 +4,12 @@ Lanes of the small environments here know their number: they are made in order.
 """
 
 import itertools
+import multiprocessing
 import os
+import random
 import signal
 import sys
+import threading
 
 import gymnasium as gym
 import imageio_ffmpeg
@@ -685,6 +688,65 @@ def test_a_process_that_dies():
         list(roll(envs, 3))
     envs.close()
     assert not any(process.is_alive() for process in envs.unwrapped.processes)
+
+
+def draws():
+    """A number of each global generator."""
+    return [np.random.rand(), random.random(), torch.rand(1).item()]  # noqa: NPY002
+
+
+def test_each_process_has_global_generators_of_its_own():
+    """What an environment draws from them when it is made, and when it is reset."""
+
+    def make(**_):
+        drawn = draws()
+        return Small(space=box(0, 1, (6,)), see=lambda env: np.array([*drawn, *draws()], np.float32))
+
+    def first(seed, first_lane=0):
+        envs = make_envs(env_id, 2, seed=seed, first_lane=first_lane, asynchronous=True)
+        observations = envs.reset()[0]["observation"].tolist()
+        envs.close()
+        return observations
+
+    env_id = register(make)
+    random.seed(0)
+    zero, one = first(7)
+    after = random.random()
+    random.seed(0)
+    assert after == [random.random(), random.random()][1], (
+        "the training's own go on, after one that asks for the spaces"
+    )
+    assert len({*zero, *one}) == 12
+    assert first(7, first_lane=1)[0] == one
+    others = [first(seed) for seed in (8, None, None)]
+    assert len({*zero, *one, *np.ravel(others)}) == 48
+
+
+@pytest.mark.parametrize(("fails", "error", "message"), [
+    (lambda: 1 / 0, ValueError, "cannot be made: environment 7 raised ZeroDivisionError when it was made: division by"),
+    (lambda: os._exit(3), RunError, "the process of environment 7 ended, with exit code 3"),
+    (sys.exit, RunError, "the process of environment 7 ended, with exit code 0"),
+])  # fmt: skip
+def test_an_environment_that_cannot_be_made_in_its_process(fails, error, message):
+    def make(**_):
+        if multiprocessing.current_process().name.endswith("-1"):
+            fails()
+        return Small()
+
+    with pytest.raises(error, match=message):
+        make_envs(register(make), 2, seed=1, first_lane=6, asynchronous=True)
+    assert not multiprocessing.active_children()
+
+
+def test_an_info_that_cannot_leave_its_process():
+    env_id = small(tell=lambda env: {"door": threading.Lock()} if env.t == 2 else {})
+    list(roll(make_envs(env_id, 2, seed=1), 3))
+    envs = make_envs(env_id, 2, seed=1, first_lane=6, asynchronous=True)
+    envs.reset()
+    what = "cannot pickle '_thread.lock' object; what it returns has to be sent from its process"
+    with pytest.raises(RunError, match=f"environment [67]: TypeError: {what}; train without --async-envs"):
+        list(roll(envs, 3))
+    envs.close()
 
 
 def test_signals_are_for_the_first_process(tiny):

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import itertools
 import os
+import random
 import re
 import signal
 import subprocess
@@ -12,13 +13,14 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from conftest import parse_args
 
 import ppo_gru
 import ppo_trxl
-from ppo_utils import environments, processes
+from ppo_utils import environments, processes, runs
 from ppo_utils.checkpoints import read_checkpoint, read_model
 from ppo_utils.logs import combine_logs
 
@@ -142,6 +144,15 @@ def test_processes_play_shares_of_the_lanes_of_one(tiny, monkeypatch):
         seeds += environments.training_envs(args, None).np_random_seed
     assert len({*seeds}) == 4
     assert seeds == list(alone.np_random_seed)
+
+
+def test_processes_have_the_same_weights_and_other_global_generators(tiny, monkeypatch):
+    drawn = []
+    for rank in (0, 1, 2):
+        monkeypatch.setattr(runs, "rank_and_size", lambda rank=rank: (rank, 3))
+        runs.prepare(tiny(), "ppo_gru", 16)
+        drawn.append((torch.rand(1).item(), np.random.rand(), random.random()))  # noqa: NPY002
+    assert [len({*each}) for each in zip(*drawn, strict=True)] == [1, 3, 3]
 
 
 def test_a_maximum_is_the_maximum_of_all_processes():

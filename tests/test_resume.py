@@ -15,6 +15,7 @@ import time
 import types
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -221,6 +222,21 @@ def test_environments_of_other_packages_begin_new_episodes(tiny, opened, curves,
     assert (scale.count, scale.discounted.any()) == (128, False), "no reward of an earlier episode counts"
     runs.run_to_end(args, run, ppo_gru.train)
     assert [step for step, _ in curves(folder)["losses/loss"]] == [64, 128, 192, 256, 320]
+
+
+@pytest.mark.parametrize("draw", [np.random.rand, random.random])
+def test_episodes_drawn_from_a_global_generator_are_not_repeated(tiny, opened, monkeypatch, draw):
+    class Drawn(type(gym.make("CueRecall-v0").unwrapped)):
+        def reset(self, **given):
+            _, info = super().reset(**given)
+            return np.full(3, draw(), np.float32), info
+
+    gym.register("Drawn-v0", Drawn)
+    args = tiny(env_id="Drawn-v0", total_timesteps=3 * 64)
+    first = opened(ppo_gru, args).rollout.next_obs["observation"]
+    folder = interrupted(monkeypatch, ppo_gru, args, 1)
+    run = opened(ppo_gru, parse_args(ppo_gru, "--resume", str(folder)))
+    assert not (run.rollout.next_obs["observation"] == first).any()
 
 
 def test_what_else_a_run_goes_on_with(tiny, opened):
