@@ -25,7 +25,9 @@ import logging
 import math
 import os
 import re
+import shutil
 import sys
+import tempfile
 import textwrap
 import zlib
 from collections import defaultdict
@@ -40,6 +42,7 @@ import numpy as np
 import torch
 import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 from tensorboard.util.tensor_util import make_ndarray
 from tqdm import tqdm
 
@@ -344,14 +347,32 @@ def read_run(path: str) -> RunLog:
     if not os.path.isdir(path):
         raise NoCurvesError(f"there is no run folder {path}")
     logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it warns of a crash where a run was resumed
-    events = EventAccumulator(path, size_guidance={"scalars": 0, "tensors": 0})
-    events.Reload()
+    events = read_events(path)
     tags = events.Tags()
     if not tags["scalars"] or "hyperparameters/text_summary" not in tags["tensors"]:
         if glob.glob(f"{path}/*.json.gz"):
             raise NoCurvesError(f"{path} is a folder of results; give the files themselves, as {path}/*.json.gz")
         raise NoCurvesError(f"{path} holds no curves of a training run")
     return RunLog(path, hyperparameters(events), event_curves(events))
+
+
+def read_events(folder: str) -> EventAccumulator:
+    """Read a run folder's TensorBoard files in the order of the steps that they begin at.
+
+    That of their names is by the clocks of the machines that wrote them, one of which may have been behind.
+    """
+    with tempfile.TemporaryDirectory() as ordered:
+        for number, path in enumerate(sorted(glob.glob(f"{glob.escape(folder)}/*tfevents*"), key=beginning)):
+            shutil.copyfile(path, f"{ordered}/events.out.tfevents.{number:010}")
+        events = EventAccumulator(ordered, size_guidance={"scalars": 0, "tensors": 0})
+        events.Reload()
+        return events
+
+
+def beginning(path: str) -> tuple[int, float]:
+    """Return the step that a TensorBoard file begins at, and the time of its first entry."""
+    first = list(itertools.islice(EventFileLoader(path).Load(), 2))  # the version, then the step that was resumed at
+    return max((event.step for event in first), default=0), min((event.wall_time for event in first), default=0.0)
 
 
 def event_curves(events: EventAccumulator) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -460,11 +460,18 @@ def test_hours_of_training():
     assert run.hours(np.array([50, 100, 150, 200, 300])).tolist() == [0.25, 0.5, 1, 1.5, 2]
 
 
-def test_a_resumed_run_counts_its_seconds_once(caplog):
-    """It stopped in iteration 5 and goes on after iteration 2, as its second file's first event says."""
+@pytest.mark.parametrize("clock", ["0", "9999999999"])
+def test_a_resumed_run_counts_its_seconds_once(caplog, clock):
+    """It stopped in iteration 5 and goes on after iteration 2, as its second file's first event says.
+
+    Also if the clock of the first machine was ahead, which the file's name tells.
+    """
     write_events("a", 1, [(1, 1), (2, 1), (30, 10), (40, 10)], num_steps=64)
     (first,) = Path("a").iterdir()
-    first.rename("a/events.out.tfevents.0")  # the files are read in the order of their names
+    first.rename(f"a/events.out.tfevents.{clock}")
+    write_events("a", 1, [(50, 10)] * 9, begin=200, purge_step=201)  # killed before its first checkpoint
+    (second,) = {*Path("a").iterdir()} - {Path(f"a/events.out.tfevents.{clock}")}
+    second.rename("a/events.out.tfevents.8888888888")
     write_events("a", 1, [(3, 1), (4, 1), (5, 1)], begin=200, purge_step=201, num_steps=128)
     run = evaluate.read_run("a")
     steps, _ = run.curves["charts/seconds_iteration"]
