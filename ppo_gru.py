@@ -29,7 +29,7 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -41,11 +41,13 @@ from torch import Tensor, nn
 from torch.distributions import Categorical
 from torch.nn.utils.rnn import pad_sequence
 
-from ppo_utils.environments import as_tensors, training_envs
+from ppo_utils.environments import as_tensors
 from ppo_utils.evaluation import make_agent
-from ppo_utils.fast import encode, first_occurrences, in_chunks, packed_gru
-from ppo_utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, UnitInterval, bounded
+from ppo_utils.fast import Muon, encode, first_occurrences, in_chunks, packed_gru
+from ppo_utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, RunArgs, UnitInterval
 from ppo_utils.infos import add_ended, final_observations, ground_truth_of
+from ppo_utils.logs import mean_logs
+from ppo_utils.moments import Moments
 from ppo_utils.processes import all_gather, average_gradients
 from ppo_utils.run import Run
 from ppo_utils.runs import command, end_iteration, open_run, prepare, report_out_of_memory, run_to_end
@@ -53,58 +55,8 @@ from ppo_utils.runs import command, end_iteration, open_run, prepare, report_out
 
 # ---- 1 ARGS ----
 @dataclass
-class Args:
+class Args(RunArgs):
     """Train a PPO agent with a recurrent memory."""
-
-    exp_name: str = Path(__file__).stem
-    """name of the experiment, part of the run folder's name"""
-    preset: Literal["thesis", "laptop", "quickstart"] = "thesis"
-    """a set of defaults, listed above; explicit flags override it (in Python: Args(**PRESETS["laptop"]))"""
-    seed: NonNegativeInt = 1
-    """seed of weights, actions and environments; on a CPU with as many threads, a run is repeated bit for bit"""
-    torch_deterministic: bool = True
-    """ask cuDNN for deterministic algorithms"""
-    cuda: bool = True
-    """train on the GPU if there is one"""
-    amp: bool = False
-    """compute in bfloat16, apart from recurrent layers, heads and losses"""
-    track: bool = False
-    """log to Weights and Biases too (extra `track`); WANDB_PROJECT and WANDB_ENTITY name project and team"""
-    capture_video: bool = False
-    """record some episodes of the first environment (extra `play`)"""
-    save_model: bool = False
-    """write model.pt to the run folder when training ends"""
-    load_model: str | None = None
-    """start from the weights in this model.pt or checkpoint; optimizer and step count start afresh"""
-    resume: str | None = None
-    """continue the run in this folder from its last checkpoint; only --total-timesteps may change, to a larger value"""
-    checkpoint_interval: NonNegativeInt = 50
-    """iterations between checkpoints, with another one at the end (0: no checkpoints); the last two are kept"""
-
-    env_id: str = "MortarMayhem-Grid-v0"
-    """any Gymnasium id with Discrete or MultiDiscrete actions; as module:id if importing a module registers it"""
-    env_options: str = "{}"
-    """reset options of a Memory Gym environment as JSON, e.g. '{"command_count": [4]}'"""
-    env_kwargs: str = "{}"
-    """constructor arguments of another package's environment as JSON, e.g. '{"size": 9}'"""
-    async_envs: bool = False
-    """train in environments that are each a process of their own, for slow ones of other packages"""
-    num_levels: NonNegativeInt = 100_000
-    """number of levels to train on (0: no limit); in environments of other packages, a level is a seed"""
-    start_level: NonNegativeInt = 0
-    """the first of these levels"""
-    obs_type: Literal["pixels", "grayscale", "vector"] = "pixels"
-    """what a Memory Gym environment shows: images in color or in gray, or vectors of what can be seen on them"""
-    frame_stack: NonNegativeInt = 0
-    """observe the last K images, in grayscale, or the last K vectors (0: the current one, in color)"""
-    step_encoding: bool = False
-    """also observe a sinusoidal encoding of the episode's step"""
-    observe_last_action: bool = False
-    """also observe the last action and the last reward"""
-    spotlight_perturbation: bool = False
-    """cover the image with a translucent white layer in which moving spotlights leave holes (thesis §7.2)"""
-    vector_frequencies: bounded(int, 0, 16) = 0
-    """also observe Fourier features of vectors with entries from 0 to 1, at this many frequencies"""
 
     total_timesteps: PositiveInt = 163_840_000
     """environment steps to train for, rounded down to whole iterations of num_envs x num_steps"""
@@ -125,7 +77,7 @@ class Args:
     bootstrap_truncated: bool = False
     """add the value of the final observation where a time limit ended an episode; without, it counts as terminated"""
     norm_reward: bool = False
-    """divide rewards by the running standard deviation of the discounted return; logged returns are not divided"""
+    """divide rewards by the running standard deviation of the discounted return, and clip them to +-10; not in logs"""
     norm_adv: Literal["none", "minibatch", "batch"] = "none"
     """normalize the advantages of each minibatch, or of the whole rollout, to mean 0 and standard deviation 1"""
     clip_coef: PositiveFloat = 0.1
@@ -140,8 +92,6 @@ class Args:
     """end the update at a minibatch whose approximate KL divergence from the rollout's policy exceeds this (above 0)"""
     optimizer: Literal["adamw", "muon"] = "adamw"
     """muon: Muon for the matrices between hidden layers, AdamW for all other weights"""
-    muon_lr_ratio: bounded(float, 0, 1000, above=True) = 3.0
-    """learning rate of Muon, in multiples of AdamW's (--init-lr, --final-lr)"""
     init_lr: UnitInterval = 2.75e-4
     """initial learning rate"""
     final_lr: UnitInterval = 1.0e-5
@@ -152,29 +102,22 @@ class Args:
     """initial weight of the exploration bonus"""
     final_ent_coef: NonNegativeFloat = 1.0e-6
     """weight of the exploration bonus from --anneal-steps on"""
-    anneal_steps: NonNegativeInt = 163_840_000
-    """steps over which learning rate and bonus weight decay linearly, whatever --total-timesteps is (0: no decay)"""
+    anneal_steps: NonNegativeInt | None = 163_840_000
+    """steps over which learning rate and bonus weight decay linearly (0: no decay; None: --total-timesteps)"""
     reconstruction_coef: NonNegativeFloat = 0.0
     """weight of the loss of reconstructing the observed image (0: off; thesis: 0.1)"""
-    reconstruction_detach: bool = False
-    """only the decoder learns from this loss"""
     ground_truth_coef: NonNegativeFloat = 0.0
     """weight of the loss of estimating the environment's ground truth (0: off; thesis: 0.1)"""
-    ground_truth_detach: bool = False
-    """only the estimator learns from this loss"""
+    auxiliary_detach: bool = False
+    """only the decoder and the estimator learn from these two losses"""
     embedding: bool = True
     """a linear layer and a ReLU between encoder and memory"""
     trunk_size: PositiveInt = 512
     """width of the layer after the memory, and of the hidden layers of policy and value"""
     value_init_gain: NonNegativeFloat = 1.0
     """gain of the orthogonal initialization of the value's last layer; smaller: initial values closer to 0"""
-
-    eval_interval: NonNegativeInt = 0
-    """iterations between evaluations on unseen levels, with another one at the end (0: no evaluations)"""
-    eval_levels: PositiveInt = 50
-    """number of levels of an evaluation, which follow those of the training; each is played three times"""
-    eval_max_steps: PositiveInt = 10_000
-    """an evaluation cuts episodes off after this many steps"""
+    amp: bool = False
+    """compute in bfloat16, apart from recurrent layers, heads and losses"""
 
     memory: Literal["gru", "lstm", "none"] = "gru"
     """what the agent remembers with"""
@@ -188,38 +131,24 @@ class Args:
 
 LAPTOP = {
     "preset": "laptop",
-    "obs_type": "vector",
-    "hidden_size": 128,
-    "trunk_size": 128,
-    "num_envs": 128,
-    "num_steps": 128,
-    "optimizer": "muon",
-    "update_epochs": 2,
-    "num_minibatches": 16,
-    "norm_reward": True,
-    "gamma": 0.99,
-    "clip_coef": 0.2,
-    "max_grad_norm": 0.5,
-    "target_kl": 0.05,
-    "init_lr": 1e-3,
-    "final_lr": 1e-4,
-    "exploration_bonus": "log-barrier",
-    "init_ent_coef": 2e-3,
-    "final_ent_coef": 2e-4,
-    "anneal_steps": 6_000_000,
-    "total_timesteps": 6_000_000,
-}
+    # what is observed and the width of the network
+    "obs_type": "vector", "hidden_size": 128, "trunk_size": 128,
+    # rollouts and minibatches
+    "num_envs": 128, "num_steps": 128, "num_minibatches": 16, "update_epochs": 2,
+    # PPO
+    "norm_reward": True, "gamma": 0.99, "clip_coef": 0.2, "target_kl": 0.05, "max_grad_norm": 0.5,
+    "exploration_bonus": "log-barrier", "init_ent_coef": 2e-3, "final_ent_coef": 2e-4,
+    # the schedule
+    "optimizer": "muon", "init_lr": 1e-3, "final_lr": 1e-4, "total_timesteps": 6_000_000, "anneal_steps": None,
+}  # fmt: skip
 QUICKSTART = {
     **LAPTOP,
     "preset": "quickstart",
     # Two commands, each shown for one step, and six steps to carry one out.
     "env_options": '{"command_count": [2], "command_show_duration": [1], "command_show_delay": [0], '
     '"explosion_delay": [4], "explosion_duration": [2]}',
-    "num_steps": 32,
-    "num_minibatches": 8,
-    "anneal_steps": 400_000,
-    "total_timesteps": 400_000,
-}
+    "num_steps": 32, "num_minibatches": 8, "total_timesteps": 400_000,
+}  # fmt: skip
 PRESETS = {"thesis": {}, "laptop": LAPTOP, "quickstart": QUICKSTART}  # thesis: the defaults above
 
 
@@ -229,26 +158,32 @@ def train(args: Args, run: Run) -> None:
 
     Raises FloatingPointError if the training diverges, RunError as `end_iteration` does.
     """
-    agent, rollout = run.agent, run.rollout
-    batch_size = args.num_envs * args.num_steps  # of all processes together
+    agent, batch_size = run.agent, args.num_envs * args.num_steps  # of all processes together
     # run.step is 0, or where the checkpoint of --resume was written.
     for global_step in range(run.step, args.total_timesteps - batch_size + 1, batch_size):
         began = time.perf_counter()
         run.iteration = global_step // batch_size + 1
         lr = anneal(global_step, args.init_lr, args.final_lr, args.anneal_steps)
         ent_coef = anneal(global_step, args.init_ent_coef, args.final_ent_coef, args.anneal_steps)
-        for optimizer, ratio in zip(run.optimizers, (1.0, args.muon_lr_ratio), strict=False):
-            optimizer.param_groups[0]["lr"] = lr * ratio
+        for optimizer in run.optimizers:
+            optimizer.param_groups[0]["lr"] = lr * optimizer.param_groups[0]["lr_ratio"]
 
-        last_value, episodes = collect(agent, run.envs, rollout, args)
+        rollout, run.carry, episodes = collect(agent, run.envs, run.carry, args)
         collected = time.perf_counter()
+        rewards = rollout.rewards
         if args.norm_reward:
-            rollout.rewards /= rollout.return_scale.update(rollout.rewards, rollout.done, args.gamma)
-        rollout.advantages = gae(rollout, last_value, args.gamma, args.gae_lambda)
+            rewards = run.return_scale.scale(rewards, rollout.done, args.gamma)
+        rollout.advantages = gae(rewards, rollout, args.gamma, args.gae_lambda)
         rollout.returns = rollout.advantages + rollout.values
-        logs = mean_logs(update(agent, run.optimizers, rollout, ent_coef, args), rollout)
+        if args.norm_adv == "batch":
+            rollout.advantages = normalize(rollout.advantages)
+        step_logs, memory = update(agent, run.optimizers, rollout, ent_coef, args)
+        if args.refresh_memory:
+            run.carry.memory = agent.memory.carry(memory)
         updated = time.perf_counter()
 
+        logs = mean_logs(step_logs, rollout.values, rollout.returns)
+        del rollout, memory  # before the next one is collected: one at a time is in memory
         logs |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
         logs |= {"charts/seconds_collect": collected - began, "charts/seconds_update": updated - collected}
         logs |= {"charts/seconds_iteration": updated - began}
@@ -259,10 +194,20 @@ def train(args: Args, run: Run) -> None:
 
 
 @dataclass
+class Carry:
+    """What one rollout of N environments hands to the next."""
+
+    obs: dict[str, np.ndarray]  # each (N, ...), the next observations
+    ground_truth: np.ndarray | None  # (N, G), if it is estimated
+    memory: dict[str, Tensor]  # what `Memory.begin_rollout` takes
+
+
+@dataclass
 class Rollout:
-    """T steps of N environments, and what the next rollout goes on with, which overwrites them."""
+    """T steps of N environments."""
 
     obs: dict[str, Tensor]  # each (T, N, ...): uint8 pixels stay uint8
+    ground_truth: Tensor | None  # (T, N, G), if it is estimated
     actions: Tensor  # (T, N, A)
     log_probs: Tensor  # (T, N, A)
     values: Tensor  # (T, N)
@@ -270,15 +215,12 @@ class Rollout:
     terminated: Tensor  # (T, N) the step ended its episode
     truncated: Tensor  # (T, N) the step ended its episode by a time limit
     truncation_values: Tensor  # (T, N) value of the final observation, 0 where not bootstrapped
-    ground_truth: Tensor | None  # (T, N, G), if it is estimated
-    next_obs: dict[str, np.ndarray]  # each (N, ...)
-    next_ground_truth: np.ndarray | None  # (N, G)
-    memory_state: MemoryState
-    initial_memory: dict[str, Tensor]  # what the rollout began with, for --refresh-memory
-    return_scale: ReturnScale  # for --norm-reward
+    initial_memory: dict[str, Tensor]  # what the memory began with, for --refresh-memory
+    memory: MemoryState  # what the memory stored of each step
+    last_value: Tensor | None = None  # (N,) of the observation after the last step
+    first_occurrence: Tensor | None = None  # (T * N,) flat index of the first equal observation; see `encode`
     advantages: Tensor | None = None  # (T, N)
     returns: Tensor | None = None  # (T, N)
-    first_occurrence: Tensor | None = None  # (T * N,) flat index of the first equal observation; see `encode`
 
     @property
     def done(self) -> Tensor:
@@ -286,18 +228,18 @@ class Rollout:
         return self.terminated | self.truncated
 
     @classmethod
-    def allocate(cls, num_steps: int, obs: dict[str, np.ndarray], truth: np.ndarray | None, agent: Agent) -> Rollout:
-        """Make a rollout on the agent's device that begins with these observations and ground truths."""
-        num_envs = len(next(iter(obs.values())))
+    def allocate(cls, num_steps: int, carry: Carry, agent: Agent) -> Rollout:
+        """Make a rollout of zeros on the agent's device."""
         device = next(agent.parameters()).device
+        obs = as_tensors(carry.obs, device)
+        num_envs, branches = len(next(iter(obs.values()))), len(agent.heads.nvec)
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(num_steps, num_envs, *shape, dtype=dtype, device=device)
 
-        branches = len(agent.heads.nvec)
-        state = agent.memory.initial_state(num_envs, num_steps, device)
         return cls(
-            obs={name: zeros(*part.shape[1:], dtype=part.dtype) for name, part in as_tensors(obs, device).items()},
+            obs={name: zeros(*part.shape[1:], dtype=part.dtype) for name, part in obs.items()},
+            ground_truth=None if carry.ground_truth is None else zeros(carry.ground_truth.shape[1]),
             actions=zeros(branches, dtype=torch.int64),
             log_probs=zeros(branches),
             values=zeros(),
@@ -305,78 +247,72 @@ class Rollout:
             terminated=zeros(dtype=torch.bool),
             truncated=zeros(dtype=torch.bool),
             truncation_values=zeros(),
-            ground_truth=None if truth is None else zeros(truth.shape[1]),
-            next_obs=obs,
-            next_ground_truth=truth,
-            memory_state=state,
-            initial_memory=agent.memory.carry(state),
-            return_scale=ReturnScale(torch.zeros(num_envs, device=device)),
+            initial_memory=carry.memory,
+            memory=agent.memory.begin_rollout(carry.memory, num_steps),
         )
 
 
 @torch.no_grad()
 def collect(
-    agent: Agent, envs: gym.vector.VectorEnv, rollout: Rollout, args: Args
-) -> tuple[Tensor, dict[str, list[float]]]:
-    """Act for T steps in all environments; return the value (N,) of the next step, and metrics of the ended episodes.
+    agent: Agent, envs: gym.vector.VectorEnv, carry: Carry, args: Args
+) -> tuple[Rollout, Carry, dict[str, list[float]]]:
+    """Act for T steps in all environments; return the steps, what the next rollout begins with, and metrics.
 
-    An ended episode is reset in the same step, so that next_obs begins the next one. Metrics: see `add_ended`.
+    An ended episode is reset in the same step, so that the next observation begins another one. Metrics of the
+    episodes that ended: see `add_ended`.
     """
-    device, state = rollout.values.device, rollout.memory_state
-    episodes = defaultdict(list)
-    rollout.truncation_values.zero_()
-    rollout.initial_memory = agent.memory.carry(state)
+    device = next(agent.parameters()).device
+    obs, ground_truth, episodes = carry.obs, carry.ground_truth, defaultdict(list)
     with torch.autocast(device.type, torch.bfloat16, enabled=args.amp):
-        agent.memory.begin_rollout(state, rollout.initial_memory)
+        rollout = Rollout.allocate(args.num_steps, carry, agent)
         for t in range(args.num_steps):
-            for name, part in rollout.next_obs.items():
+            for name, part in obs.items():
                 rollout.obs[name][t] = torch.from_numpy(part)
-            if rollout.ground_truth is not None:
-                rollout.ground_truth[t] = torch.as_tensor(rollout.next_ground_truth)
-            obs = {name: part[t] for name, part in rollout.obs.items()}
-            rollout.actions[t], rollout.log_probs[t], rollout.values[t] = agent.get_action_and_value(obs, state)
+            if ground_truth is not None:
+                rollout.ground_truth[t] = torch.from_numpy(ground_truth)
+            now = {name: part[t] for name, part in rollout.obs.items()}
+            actions, rollout.log_probs[t], rollout.values[t] = agent.get_action_and_value(now, rollout.memory)
+            rollout.actions[t] = actions
 
-            next_obs, rewards, terminated, truncated, infos = envs.step(rollout.actions[t].cpu().numpy())
+            obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
             done = terminated | truncated
             rollout.rewards[t] = torch.as_tensor(rewards)
             rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
             if args.bootstrap_truncated and truncated.any():
-                final = as_tensors(final_observations(next_obs, infos, truncated), device)
-                value = agent.get_value(final, state)  # with the memory of the episode that ended
+                final = as_tensors(final_observations(obs, infos, truncated), device)
+                value = agent.get_value(final, rollout.memory)  # with the memory of the episode that ended
                 rollout.truncation_values[t] = value.where(rollout.truncated[t] & ~rollout.terminated[t], 0.0)
-            agent.memory.reset(state, torch.as_tensor(done))
-            rollout.next_obs = next_obs
-            rollout.next_ground_truth = ground_truth_of(infos, args, rollout.next_ground_truth)
+            agent.memory.reset(rollout.memory, torch.as_tensor(done))
+            ground_truth = ground_truth_of(infos, args, ground_truth)
             add_ended(episodes, infos, done)
-        return agent.get_value(as_tensors(rollout.next_obs, device), state), episodes
+        rollout.last_value = agent.get_value(as_tensors(obs, device), rollout.memory)
+    rollout.first_occurrence = first_occurrences(rollout.obs)  # for speed: on a CPU, equal images are encoded once
+    return rollout, Carry(obs, ground_truth, agent.memory.carry(rollout.memory)), episodes
 
 
 def update(
     agent: Agent, optimizers: list[torch.optim.Optimizer], rollout: Rollout, ent_coef: float, args: Args
-) -> list[dict[str, Tensor]]:
-    """Learn from the rollout for some epochs; return what to log of each minibatch."""
-    if args.norm_adv == "batch":
-        rollout.advantages = normalize(rollout.advantages)
-    rollout.first_occurrence = first_occurrences(rollout.obs)  # for speed: on a CPU, equal images are encoded once
+) -> tuple[list[dict[str, Tensor]], MemoryState]:
+    """Learn from the rollout for some epochs; return what to log of each minibatch, and the memory's last state."""
     pieces = agent.memory.cut(rollout.done.cpu())
     step_logs = []
     for epoch in range(args.update_epochs):
         if args.refresh_memory and epoch > 0:
-            refresh_memory(agent, rollout, args)
+            rollout = replace(rollout, memory=refreshed_memory(agent, rollout, args))
         for minibatch in pieces.minibatches(args.num_minibatches):
             loss, logs = ppo_loss(agent, rollout, minibatch, ent_coef, args)
             step_logs.append(logs)
             if args.target_kl is not None and len(step_logs) > 1:  # the first one's is 0: nothing has been learned yet
                 kl = np.mean(all_gather(logs["approx_kl"].item()))  # all processes stop together
                 if kl > args.target_kl:
-                    return step_logs
+                    return step_logs, rollout.memory
             agent.zero_grad()
             loss.backward()
             average_gradients(agent, int(minibatch.length.sum()))  # over processes, if there are several
             logs["grad_norm"] = clip_gradients(agent, args)
             for optimizer in optimizers:
                 optimizer.step()
-    return step_logs
+    return step_logs, rollout.memory
 
 
 def ppo_loss(
@@ -392,7 +328,7 @@ def ppo_loss(
     with autocast:
         x = encode(agent.encoder, rollout.obs, index, rollout.first_occurrence)  # (B, I)
         actions = gather(rollout.actions)  # (B, A)
-        policy, log_probs, values, features = agent.evaluate_actions(x, actions, minibatch, rollout.memory_state)
+        policy, log_probs, values, features = agent.evaluate_actions(x, actions, minibatch, rollout.memory)
     log_ratio = log_probs - gather(rollout.log_probs)  # (B, A)
     advantages, old_values, returns = gather(rollout.advantages), gather(rollout.values), gather(rollout.returns)
     if args.norm_adv == "minibatch":
@@ -403,64 +339,49 @@ def ppo_loss(
     barrier = log_barrier(policy)
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * (entropy if args.exploration_bonus == "entropy" else barrier)
     logs = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, "log_barrier": barrier}
+    if args.auxiliary_detach:
+        features = features.detach()
     if agent.decoder is not None:  # (5.5)
         with autocast:
-            logits = in_chunks(agent.decoder, features.detach() if args.reconstruction_detach else features)
+            logits = in_chunks(agent.decoder, features)
         pixels = gather(rollout.obs[agent.encoder.images[0]])  # (B, height, width, channels)
         target = pixels / 255 if pixels.dtype == torch.uint8 else pixels
         logs["reconstruction_loss"] = F.binary_cross_entropy_with_logits(logits.float(), target)
         loss = loss + args.reconstruction_coef * logs["reconstruction_loss"]
     if agent.estimator is not None:  # (5.6)
-        estimate = agent.estimator(features.detach() if args.ground_truth_detach else features)  # (B, G)
-        logs["ground_truth_loss"] = F.mse_loss(estimate, gather(rollout.ground_truth))
+        logs["ground_truth_loss"] = F.mse_loss(agent.estimator(features), gather(rollout.ground_truth))
         loss = loss + args.ground_truth_coef * logs["ground_truth_loss"]
     logs |= {"loss": loss, **policy_metrics(log_ratio, args.clip_coef)}
     return loss, {name: value.detach() for name, value in logs.items()}
 
 
 @torch.no_grad()
-def refresh_memory(agent: Agent, rollout: Rollout, args: Args) -> None:
-    """Recompute what the rollout stored of the memory, with the current weights (§7.1.4; Kapturowski et al., 2019).
+def refreshed_memory(agent: Agent, rollout: Rollout, args: Args) -> MemoryState:
+    """Return what the memory would have stored with the current weights (§7.1.4; Kapturowski et al., 2019).
 
-    What it began with is not recomputed. With the weights that acted, nothing changes, up to rounding.
+    What the rollout began with is not recomputed. With the weights that acted, it is the same, up to rounding.
     """
-    state, done = rollout.memory_state, rollout.done.cpu()
+    done = rollout.done.cpu()
     with torch.autocast(rollout.values.device.type, torch.bfloat16, enabled=args.amp):
-        agent.memory.begin_rollout(state, rollout.initial_memory)
+        state = agent.memory.begin_rollout(rollout.initial_memory, len(done))
         for t in range(len(done)):
             x = agent.encoder({name: part[t] for name, part in rollout.obs.items()})
             _, hidden = agent.memory.step(state, x)
             agent.memory.advance(state, hidden)
             agent.memory.reset(state, done[t])
+    return state
 
 
 def clip_gradients(agent: Agent, args: Args) -> Tensor:
     """Scale the gradient down to --max-grad-norm if its norm is larger; return the norm before.
 
-    A detached network is clipped by itself, so that it does not change the agent's step.
+    With --auxiliary-detach, each auxiliary head is clipped by itself, so that it does not change the agent's step.
     """
-    own = {*agent.parameters()}
-    for network, detached in ((agent.decoder, args.reconstruction_detach), (agent.estimator, args.ground_truth_detach)):
-        if detached:
-            nn.utils.clip_grad_norm_(network.parameters(), args.max_grad_norm)
-            own -= {*network.parameters()}
-    return nn.utils.clip_grad_norm_([each for each in agent.parameters() if each in own], args.max_grad_norm)
-
-
-def mean_logs(step_logs: list[dict[str, Tensor]], rollout: Rollout) -> dict[str, float]:
-    """Return the means of what an update logged; the minibatch at which --target-kl ended it has no gradient norm.
-
-    Raises FloatingPointError if a loss or a gradient was not finite: the weights are unusable then.
-    """
-    logged = {name: [logs[name] for logs in step_logs if name in logs] for name in step_logs[0]}
-    losses = {name: torch.stack(each).mean().item() for name, each in logged.items()}
-    if not (math.isfinite(losses["loss"]) and math.isfinite(losses["grad_norm"])):
-        raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr, or smaller rewards")
-    # Before the first gradient step, ratios differ from 1 by rounding only, if the update recomputes what acted.
-    losses["ratio_error"] = step_logs[0]["ratio_error"].item()
-    losses["explained_variance"] = explained_variance(rollout.values, rollout.returns)
-    gradient_steps = len(logged["grad_norm"])
-    return {f"losses/{name}": value for name, value in losses.items()} | {"charts/gradient_steps": gradient_steps}
+    parameters = {*agent.parameters()}
+    for head in agent.auxiliary_heads() if args.auxiliary_detach else ():
+        nn.utils.clip_grad_norm_(head.parameters(), args.max_grad_norm)
+        parameters -= {*head.parameters()}
+    return nn.utils.clip_grad_norm_([each for each in agent.parameters() if each in parameters], args.max_grad_norm)
 
 
 # ---- 3 PPO ----
@@ -470,58 +391,32 @@ def anneal(step: int, initial: float, final: float, anneal_steps: int) -> float:
     return initial + fraction * (final - initial)
 
 
-def gae(rollout: Rollout, last_value: Tensor, gamma: float, gae_lambda: float) -> Tensor:
+def gae(rewards: Tensor, rollout: Rollout, gamma: float, gae_lambda: float) -> Tensor:
     """Return the advantages (T, N) of generalized advantage estimation (2.34), cut wherever an episode ends.
 
-    last_value (N,) is the value of the observation after the last step. Where an episode ended, the next value is the
-    bootstrapped value of its final observation, or zero.
+    Where an episode ended, the next value is the bootstrapped value of its final observation, or zero.
     """
-    next_values = torch.cat([rollout.values[1:], last_value[None]])  # (T, N)
+    next_values = torch.cat([rollout.values[1:], rollout.last_value[None]])  # (T, N)
     next_values = torch.where(rollout.done, rollout.truncation_values, next_values)
-    deltas = rollout.rewards + gamma * next_values - rollout.values
+    deltas = rewards + gamma * next_values - rollout.values
     decay = gamma * gae_lambda * ~rollout.done
     advantages = torch.empty_like(deltas)
-    advantage = torch.zeros_like(last_value)
+    advantage = torch.zeros_like(rollout.last_value)
     for t in reversed(range(len(deltas))):
         advantages[t] = advantage = deltas[t] + decay[t] * advantage
     return advantages
 
 
-@dataclass
-class ReturnScale:
-    """Mean and variance, over all steps, of the discounted sum of an episode's rewards (Engstrom et al., 2020).
-
-    Rewards are divided by its deviation. No mean is subtracted, so that they keep their sign; nothing is clipped.
-    """
-
-    discounted: Tensor  # (N,) that sum in the present episodes
-    count: int = 0
-    mean: float = 0.0
-    variance: float = 0.0
-
-    def update(self, rewards: Tensor, done: Tensor, gamma: float) -> float:
-        """Take in a rollout's rewards (T, N); return the standard deviation, 1 as long as all returns are equal."""
-        returns = torch.zeros_like(rewards)
-        for t in range(len(rewards)):
-            returns[t] = self.discounted * gamma + rewards[t]
-            self.discounted = returns[t] * ~done[t]
-        ours = returns.numel(), returns.double().mean().item(), returns.double().var(correction=0).item()
-        for count, mean, variance in all_gather(ours):  # merged as in Chan et al. (1979)
-            self.count += count
-            share, delta = count / self.count, mean - self.mean
-            self.variance += share * (variance - self.variance + (1 - share) * delta**2)
-            self.mean += share * delta
-        return math.sqrt(self.variance) or 1.0
-
-
 def normalize(x: Tensor) -> Tensor:
-    """Return x with mean 0 and standard deviation 1."""
-    return (x - x.mean()) / (x.std(correction=0) + 1e-8)
+    """Return x with mean 0 and standard deviation 1, over all processes."""
+    moments = Moments()
+    moments.add(x)
+    return (x - moments.mean) / (moments.deviation + 1e-8)
 
 
 def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tensor:
     """Return the clipped surrogate loss (2.41) of log_ratio (B, A): its mean over branches (5.4) and samples."""
-    ratio = log_ratio.exp()
+    ratio = log_ratio.clamp(max=20).exp()  # from 89 on, it would be infinite, and with an advantage of 0 NaN
     advantages = advantages[:, None]
     clipped = ratio.clamp(1 - clip_coef, 1 + clip_coef)
     return -torch.minimum(ratio * advantages, clipped * advantages).mean()
@@ -556,12 +451,6 @@ def policy_metrics(log_ratio: Tensor, clip_coef: float) -> dict[str, Tensor]:
         "clipfrac": (deviation.abs() > clip_coef).float().mean(),
         "ratio_error": deviation.abs().max(),
     }
-
-
-def explained_variance(values: Tensor, returns: Tensor) -> float:
-    """Return the share of the returns' variance that the values explain; NaN if the returns do not vary."""
-    variance = returns.var().item()
-    return 1 - (returns - values).var().item() / variance if variance > 0 else math.nan
 
 
 @dataclass
@@ -622,7 +511,7 @@ class Pieces:
     def minibatches(self, count: int) -> Iterator[Pieces]:
         """Shuffle the pieces, and distribute them over count minibatches of about the same number of steps.
 
-        None is empty, unless a piece is longer than 1 / count of all steps, which `prepare` has ruled out.
+        None is empty, unless a piece is longer than 1 / count of all steps, which `open_run` has ruled out.
         """
         order = torch.randperm(len(self.first))
         first, length = self.first[order], self.length[order]
@@ -636,18 +525,18 @@ class Pieces:
 
 # ---- 4 MEMORY ----
 # The interface of a memory, which the other sections use:
-#   initial_state            the state of fresh episodes, with room for what a rollout stores
-#   carry, begin_rollout     what one rollout hands to the next; begin a rollout with it
+#   initial, carry           what episodes begin with, what the next rollout goes on with: a dict of tensors
+#   begin_rollout            from such a dict, the state of a rollout, with room for what its steps store
 #   step, advance, reset     compute a step; store it and move on; forget the episodes that ended
 #   cut, unroll              cut a rollout into pieces; compute whole pieces at once in the update
 #   width, flags             D, the width of its output; the arguments that loaded weights must have been trained with
-#   input_width, longest_piece    from the arguments alone: the width of an embedding, the most steps of a piece
-# begin_rollout, advance and reset change a state in place; all others only read it.
+#   input_width              from the arguments alone: the width of an embedding
+# advance and reset change a state in place; all others only read it.
 @dataclass
 class MemoryState:
     """What N environments remember, and what the update needs of the rollout's steps."""
 
-    t: int  # the step of the rollout that comes next
+    now: int  # the step of the rollout that comes next
     hidden: Tensor  # (N, P, D) the hidden state before that step
     stored: Tensor  # (T, N, P, D) the hidden state before each step
 
@@ -679,23 +568,18 @@ class Memory(nn.Module):
         """Return the width that the encoded observation is embedded in."""
         return args.hidden_size
 
-    @staticmethod
-    def longest_piece(args: Args) -> int:
-        """Return the most steps that a piece of a rollout can have."""
-        return 1 if args.memory == "none" else min(args.seq_len or args.num_steps, args.num_steps)
-
-    def initial_state(self, num_envs: int, num_steps: int, device: torch.device) -> MemoryState:
-        """Return the state of fresh episodes, zeros, with room for a rollout of num_steps."""
-        hidden = torch.zeros(num_envs, self.hidden_vectors, self.width, device=device)
-        return MemoryState(0, hidden, torch.zeros(num_steps, *hidden.shape, device=device))
+    def initial(self, num_envs: int, device: torch.device) -> dict[str, Tensor]:
+        """Return the memory of fresh episodes: zeros."""
+        return {"hidden": torch.zeros(num_envs, self.hidden_vectors, self.width, device=device)}
 
     def carry(self, state: MemoryState) -> dict[str, Tensor]:
-        """Return what the next rollout begins with: the hidden state, which nothing changes in place."""
+        """Return what the next rollout goes on with: the hidden state, which nothing changes in place."""
         return {"hidden": state.hidden}
 
-    def begin_rollout(self, state: MemoryState, carry: dict[str, Tensor]) -> None:
-        """Go on with what `carry` returned, and store from the beginning again."""
-        state.t, state.hidden = 0, carry["hidden"].to(state.stored.device)
+    def begin_rollout(self, carry: dict[str, Tensor], num_steps: int) -> MemoryState:
+        """Return a state that goes on with what `initial` or `carry` returned, with room for num_steps."""
+        hidden = carry["hidden"]
+        return MemoryState(0, hidden, hidden.new_zeros(num_steps, *hidden.shape))
 
     def step(self, state: MemoryState, x: Tensor) -> tuple[Tensor, Tensor]:
         """Compute one step of all environments, x (N, I): the output (N, D) and the next hidden state (N, P, D)."""
@@ -706,11 +590,11 @@ class Memory(nn.Module):
 
     def advance(self, state: MemoryState, hidden: Tensor) -> None:
         """Store the hidden state before the step, and move on to the one after it."""
-        if state.t == len(state.stored):
-            raise IndexError("there is no room for this step; begin_rollout(state, carry(state)) makes room again")
-        state.stored[state.t] = state.hidden
+        if state.now == len(state.stored):
+            raise IndexError("there is no room for this step; begin_rollout(carry(state), num_steps) makes room again")
+        state.stored[state.now] = state.hidden
         state.hidden = hidden
-        state.t += 1
+        state.now += 1
 
     def reset(self, state: MemoryState, done: Tensor) -> None:
         """Forget the episodes that ended: done (N,), on the CPU."""
@@ -878,15 +762,22 @@ class Agent(nn.Module):
             self.decoder = Decoder(args.trunk_size, images[0]) if args.reconstruction_coef else None
             self.estimator = mlp_head(args.trunk_size, ground_truth_size, 1.0) if args.ground_truth_coef else None
 
-    def get_action_and_value(self, obs: dict[str, Tensor], state: MemoryState) -> tuple[Tensor, Tensor, Tensor]:
+    def auxiliary_heads(self) -> list[nn.Module]:
+        """Return the networks that neither act nor value: decoder and estimator, as far as there are any."""
+        return [head for head in (self.decoder, self.estimator) if head is not None]
+
+    def get_action_and_value(
+        self, obs: dict[str, Tensor], state: MemoryState, deterministic: bool = False
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Act in all environments, and move the memory's state on to the next step.
 
-        Returns actions (N, A), their log-probabilities (N, A) and values (N,).
+        deterministic: take each branch's most probable action instead of sampling. Returns actions (N, A), their
+        log-probabilities (N, A) and values (N,).
         """
         x, hidden = self.memory.step(state, self.encoder(obs))
         self.memory.advance(state, hidden)
         policy, values, _ = self.heads(x)
-        actions = torch.stack([branch.sample() for branch in policy], -1)
+        actions = torch.stack([branch.mode if deterministic else branch.sample() for branch in policy], -1)
         return actions, log_probs_of(policy, actions), values
 
     def get_value(self, obs: dict[str, Tensor], state: MemoryState) -> Tensor:
@@ -911,15 +802,20 @@ def make_optimizers(agent: Agent, args: Args) -> list[torch.optim.Optimizer]:
 
     Its steps are orthogonal: all directions of a matrix change equally. Outer layers, whose other side is an
     observation or an output, are AdamW's, as is all that is no weight of an `nn.Linear`, such as recurrent layers.
+    `train` sets the learning rates; Muon's is three times AdamW's.
     """
-    if args.optimizer == "adamw":
-        return [torch.optim.AdamW(agent.parameters(), lr=args.init_lr, fused=True)]
-    outer = ("encoder.mlp", "heads.policy.2", "heads.value.2", "decoder", "estimator")
-    linear = {name: layer.weight for name, layer in agent.named_modules() if isinstance(layer, nn.Linear)}
-    hidden = [weight for name, weight in linear.items() if not name.startswith(outer)]
+    hidden = []
+    if args.optimizer == "muon":
+        encoder, heads = agent.encoder, agent.heads
+        inner = [encoder.embedding, agent.memory, heads.trunk, heads.policy[0], heads.value[0]]
+        layers = [layer for part in inner if part is not None for layer in part.modules()]
+        hidden = [layer.weight for layer in layers if isinstance(layer, nn.Linear)]
     others = [weight for weight in agent.parameters() if weight not in {*hidden}]
-    muon = torch.optim.Muon(hidden, weight_decay=0.01, adjust_lr_fn="match_rms_adamw")
-    return [torch.optim.AdamW(others, lr=args.init_lr, fused=True), muon]
+    adamw = torch.optim.AdamW([{"params": others, "lr": args.init_lr, "lr_ratio": 1.0}], fused=True)
+    if not hidden:
+        return [adamw]
+    group = {"params": hidden, "lr": 3.0 * args.init_lr, "lr_ratio": 3.0}
+    return [adamw, Muon([group], weight_decay=0.01, adjust_lr_fn="match_rms_adamw")]
 
 
 def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
@@ -933,16 +829,14 @@ def setup(args: Args) -> Run:
 
     Raises ValueError, OSError, ImportError, RunError or gymnasium.error.Error, each with one line for the user.
     """
-    script = Path(__file__).stem
-    device, checkpoint = prepare(args, script, Memory.longest_piece(args))  # checkpoint: None without --resume
-    with report_out_of_memory(args, device):
-        envs = training_envs(args, checkpoint)
-    with report_out_of_memory(args, device, envs.single_observation_space):
-        obs, infos = envs.reset()
-        agent = make_agent(Agent, envs, infos, args).to(device)
-        rollout = Rollout.allocate(args.num_steps, obs, ground_truth_of(infos, args), agent)
-    run = Run(script=script, envs=envs, agent=agent, optimizers=make_optimizers(agent, args), rollout=rollout)
-    return open_run(args, run, checkpoint)  # sets all of it to the checkpoint's state, if there is one
+    run, obs, infos = prepare(args, Path(__file__).stem)
+    with report_out_of_memory(args, run.device, run.envs.single_observation_space):
+        run.agent = make_agent(Agent, run.envs, infos, args).to(run.device)
+        memory = run.agent.memory.initial(run.envs.num_envs, run.device)
+        run.carry = Carry(obs, ground_truth_of(infos, args), memory)
+        Rollout.allocate(args.num_steps, run.carry, run.agent)  # does it fit?
+    run.optimizers = make_optimizers(run.agent, args)
+    return open_run(args, run)  # sets all of it to the checkpoint's state, if there is one
 
 
 def main(args: Args) -> Path:

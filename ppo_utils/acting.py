@@ -10,7 +10,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 
 from ppo_utils.checkpoints import import_script, load_weights, read_model, saved_args
 from ppo_utils.environments import as_tensors, env_actions, envs_for, wrap_envs, wrappers_of
-from ppo_utils.evaluation import MEMORY_STEPS, act, make_agent
+from ppo_utils.evaluation import MEMORY_STEPS, make_agent, with_room
 from ppo_utils.lanes import check_fits
 
 
@@ -39,7 +39,8 @@ class Player:
 
     def reset(self) -> None:
         """Forget all: the next observation is the first one of an episode."""
-        self.memory = self.agent.memory.initial_state(1, MEMORY_STEPS, torch.device("cpu"))
+        fresh = self.agent.memory.initial(1, torch.device("cpu"))
+        self.memory = self.agent.memory.begin_rollout(fresh, MEMORY_STEPS)
         self.steps, self.actions = 0, None
 
     @torch.no_grad()
@@ -52,7 +53,8 @@ class Player:
         self.given.now = observation, reward
         obs = self.envs.reset()[0] if self.actions is None else self.envs.step(self.actions)[0]
         obs = as_tensors(obs, torch.device("cpu"))
-        self.actions = act(self.agent, obs, self.memory, self.steps, self.deterministic).numpy()
+        self.memory = with_room(self.agent.memory, self.memory, self.steps)
+        self.actions = self.agent.get_action_and_value(obs, self.memory, self.deterministic)[0].numpy()
         self.steps += 1
         action = env_actions(self.given.single_action_space, self.actions)[0]
         return action if np.ndim(action) else int(action)

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from ppo_utils.environments import load_state, save_state
 from ppo_utils.evaluation import are_trained_on, first_unseen
-from ppo_utils.flags import as_flags, flag
+from ppo_utils.flags import RunArgs, as_flags, flag
 from ppo_utils.processes import all_gather, rank_and_size
 from ppo_utils.run import Run
 
@@ -44,13 +44,13 @@ SCRIPT_NAME = r"ppo_\w+"  # of what a file may import
 
 
 # ---- writing ----
-def model_of(args: Any, run: Run) -> dict[str, Any]:
+def model_of(args: RunArgs, run: Run) -> dict[str, Any]:
     """Return what a model's file holds, which is a part of what a checkpoint holds."""
     saved = {"script": run.script, "args": asdict(replace(args, resume=None)), "step": run.step}
     return saved | {"weights": run.agent.state_dict()}
 
 
-def save_checkpoint(args: Any, run: Run) -> None:
+def save_checkpoint(args: RunArgs, run: Run) -> None:
     """Write all that a run goes on with, and keep the checkpoint before it.
 
     Raises what `write_file` raises, and RunError if another process has ended.
@@ -73,15 +73,12 @@ def save_checkpoint(args: Any, run: Run) -> None:
 
 def state_of_process(run: Run) -> dict[str, Any]:
     """Return what each process goes on with: environments, memory and generators, in arrays, tensors and numbers."""
-    rollout = run.rollout
     return {
         "environments": save_state(run.envs),
-        "next_obs": rollout.next_obs,
-        "next_ground_truth": rollout.next_ground_truth,
-        "memory": run.agent.memory.carry(rollout.memory_state),
-        "return_scale": vars(rollout.return_scale),
+        "carry": vars(run.carry),
+        "return_scale": vars(run.return_scale),
         "torch": torch.get_rng_state(),
-        "cuda": torch.cuda.get_rng_state(rollout.values.device) if rollout.values.is_cuda else None,
+        "cuda": torch.cuda.get_rng_state(run.device) if run.device.type == "cuda" else None,
         "numpy": np.random.get_state(),  # noqa: NPY002 (it and Python's: environments of other packages may use them)
         "python": random.getstate(),
     }
@@ -208,7 +205,7 @@ def load_weights(agent: nn.Module, saved: dict[str, Any], path: str | Path) -> N
 
 
 # ---- going on ----
-def check_resumed(args: Any, saved: dict[str, Any], script: str) -> None:
+def check_resumed(args: RunArgs, saved: dict[str, Any], script: str) -> None:
     """Raise ValueError if the arguments are not those of the run that --resume goes on with."""
     if saved["script"] != script:
         raise ValueError(f"--resume {args.resume}: this run is {saved['script']}.py's, not {script}.py's")
@@ -234,7 +231,7 @@ def check_resumed(args: Any, saved: dict[str, Any], script: str) -> None:
         raise ValueError(f"--resume {args.resume}: this run has {before} processes, not {processes}; start as many")
 
 
-def load_model(args: Any, agent: nn.Module, script: str) -> None:
+def load_model(args: RunArgs, agent: nn.Module, script: str) -> None:
     """Give the agent the weights of --load-model; say so if they were trained on levels of this run's evaluations.
 
     Raises ValueError if another script, or one with other flags of the network, trained them; OSError without a file.
@@ -269,9 +266,11 @@ def load_learner(run: Run, saved: dict[str, Any], folder: str | Path) -> None:
     try:
         for optimizer, state in zip(run.optimizers, saved["optimizers"], strict=True):
             optimizer.load_state_dict(state)
-        shapes = {name: part.shape for name, part in run.rollout.initial_memory.items()}
+        if any("lr_ratio" not in optimizer.param_groups[0] for optimizer in run.optimizers):
+            raise KeyError
+        shapes = {name: part.shape for name, part in run.carry.memory.items()}
         for process in saved["processes"]:
-            theirs = {name: part.shape for name, part in process["memory"].items()}
+            theirs = {name: part.shape for name, part in process["carry"]["memory"].items()}
             if theirs != shapes or "return_scale" not in process:
                 raise KeyError
     except (KeyError, ValueError):
@@ -291,22 +290,20 @@ def load_process(run: Run, saved: dict[str, Any]) -> None:
     Environments of other packages begin new episodes, with a line that says so. Raises ValueError if the state is one
     of other environments.
     """
-    rank, rollout = rank_and_size()[0], run.rollout
+    rank = rank_and_size()[0]
     state = saved["processes"][rank]
-    vars(rollout.return_scale).update(state["return_scale"])
-    rollout.return_scale.discounted = rollout.return_scale.discounted.to(rollout.values.device)
+    vars(run.return_scale).update(state["return_scale"])
     random.setstate(state["python"])
     torch.set_rng_state(state["torch"])
-    if state["cuda"] is not None and rollout.values.is_cuda:
-        torch.cuda.set_rng_state(state["cuda"], rollout.values.device)
-    names = ("environments", "next_obs", "next_ground_truth", "numpy")
-    arrays = map_nested({name: state[name] for name in names}, Tensor, Tensor.numpy)
+    if state["cuda"] is not None and run.device.type == "cuda":
+        torch.cuda.set_rng_state(state["cuda"], run.device)
+    memory = {name: part.to(run.carry.memory[name].device) for name, part in state["carry"].pop("memory").items()}
+    arrays = map_nested({name: state[name] for name in ("environments", "carry", "numpy")}, Tensor, Tensor.numpy)
     np.random.set_state(arrays["numpy"])  # noqa: NPY002
     if arrays["environments"] is None:
-        rollout.return_scale.discounted.zero_()
+        run.return_scale.discounted = None
         if rank == 0:
             print(f"{run.envs.spec.id} has no state to save: every environment begins a new episode", file=sys.stderr)
         return
     load_state(run.envs, arrays["environments"])
-    rollout.next_obs, rollout.next_ground_truth = arrays["next_obs"], arrays["next_ground_truth"]
-    run.agent.memory.begin_rollout(rollout.memory_state, state["memory"])
+    run.carry = replace(run.carry, memory=memory, **arrays["carry"])

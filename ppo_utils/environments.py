@@ -27,6 +27,7 @@ import memory_gym_envs  # noqa: F401 (registers its ids)
 from memory_gym_envs.base import MemoryGymVectorEnv, checked_integer
 from memory_gym_envs.options import brief
 from memory_gym_envs.saving import Saved
+from ppo_utils.flags import RunArgs
 from ppo_utils.lanes import Levels, creator, one_line, one_line_errors, same_step_envs
 from ppo_utils.observations import ObservationParts
 from ppo_utils.processes import rank_and_size
@@ -43,7 +44,7 @@ from ppo_utils.wrappers import (
 T = TypeVar("T")  # a script's Args
 
 
-def envs_for(args: Any, num_envs: int, **kwargs: Any) -> VectorEnv:
+def envs_for(args: RunArgs, num_envs: int, **kwargs: Any) -> VectorEnv:
     """Make the environments that a script's arguments describe; kwargs and errors are those of `make_envs`."""
     ours = {name: getattr(args, name) for name in ("num_levels", "start_level", "obs_type")} | wrappers_of(args)
     options, env_kwargs = parse_options(args.env_id, args.env_options), json_object("--env-kwargs", args.env_kwargs)
@@ -51,13 +52,13 @@ def envs_for(args: Any, num_envs: int, **kwargs: Any) -> VectorEnv:
     return make_envs(args.env_id, num_envs, **ours | kwargs)
 
 
-def wrappers_of(args: Any) -> dict[str, Any]:
+def wrappers_of(args: RunArgs) -> dict[str, Any]:
     """Return the arguments of `wrap_envs` that are among a script's."""
     names = ("frame_stack", "step_encoding", "observe_last_action", "spotlight_perturbation", "vector_frequencies")
     return {name: getattr(args, name) for name in names}
 
 
-def training_envs(args: Any, checkpoint: dict[str, Any] | None) -> VectorEnv:
+def training_envs(args: RunArgs, checkpoint: dict[str, Any] | None) -> VectorEnv:
     """Make this process's share of the environments to train on. Raises as `make_envs` does."""
     rank, processes = rank_and_size()
     share = args.num_envs // processes

@@ -13,29 +13,30 @@ from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
 from ppo_utils.environments import as_tensors
+from ppo_utils.flags import RunArgs
 from ppo_utils.infos import final_numbers, ground_truth_of
 
 REPEATS = 3  # times that each level is played
-MEMORY_STEPS = 64  # that a memory has room for, until `begin_rollout` makes room again
+MEMORY_STEPS = 64  # that a memory has room for, until `with_room` makes room again
 
 
-def first_unseen(args: Any) -> int:
+def first_unseen(args: RunArgs) -> int:
     """Return the first level after those that a script's arguments train on."""
     return args.start_level + args.num_levels
 
 
-def are_trained_on(args: Any, first: int, levels: int) -> bool:
+def are_trained_on(args: RunArgs, first: int, levels: int) -> bool:
     """Return whether a script's arguments train on any of so many levels from `first` on; without a limit, on none."""
     return max(first, args.start_level) < min(first + levels, first_unseen(args))
 
 
-def evaluation_levels(args: Any, levels: int, repeats: int = REPEATS, first: int | None = None) -> list[int]:
+def evaluation_levels(args: RunArgs, levels: int, repeats: int = REPEATS, first: int | None = None) -> list[int]:
     """Return the seeds (N,) of an evaluation's levels, with repeats: from `first`, or from the first unseen one."""
     first = first_unseen(args) if first is None else first
     return [level for level in range(first, first + levels) for _ in range(repeats)]
 
 
-def make_agent(kind: type[nn.Module], envs: VectorEnv, infos: dict, args: Any) -> nn.Module:
+def make_agent(kind: type[nn.Module], envs: VectorEnv, infos: dict, args: RunArgs) -> nn.Module:
     """Make an agent, of a script's Agent, for environments; infos are those of a reset.
 
     Raises ValueError for spaces that do not suit, RunError if there is no ground truth to estimate.
@@ -45,19 +46,9 @@ def make_agent(kind: type[nn.Module], envs: VectorEnv, infos: dict, args: Any) -
     return kind(envs.single_observation_space, envs.single_action_space.nvec.tolist(), args, size)
 
 
-def act(agent: nn.Module, obs: dict[str, Tensor], state: Any, step: int, deterministic: bool) -> Tensor:
-    """Return actions (N, A), sampled or each branch's most probable one, and move the memory's state on.
-
-    step: how many came before, however many; the state has room for MEMORY_STEPS.
-    """
-    if step % MEMORY_STEPS == 0:
-        agent.memory.begin_rollout(state, agent.memory.carry(state))
-    if not deterministic:
-        return agent.get_action_and_value(obs, state)[0]
-    x, hidden = agent.memory.step(state, agent.encoder(obs))
-    agent.memory.advance(state, hidden)
-    policy, _, _ = agent.heads(x)
-    return torch.stack([branch.logits.argmax(-1) for branch in policy], -1)
+def with_room(memory: nn.Module, state: Any, step: int) -> Any:
+    """Return an agent's memory state with room for an episode's step, however many came before."""
+    return memory.begin_rollout(memory.carry(state), MEMORY_STEPS) if step and step % MEMORY_STEPS == 0 else state
 
 
 @torch.no_grad()
@@ -79,12 +70,13 @@ def evaluate(
     """
     device = next(agent.parameters()).device
     obs, _ = envs.reset(seed=levels)
-    memory = agent.memory.initial_state(len(levels), MEMORY_STEPS, device)
     playing = np.ones(len(levels), bool)
     metrics = {"return": np.zeros(len(levels)), "length": np.zeros(len(levels))}
     with torch.autocast(device.type, torch.bfloat16, enabled=amp):
+        memory = agent.memory.begin_rollout(agent.memory.initial(len(levels), device), MEMORY_STEPS)
         for t in range(max_steps):
-            actions = act(agent, as_tensors(obs, device), memory, t, deterministic)
+            memory = with_room(agent.memory, memory, t)
+            actions, *_ = agent.get_action_and_value(as_tensors(obs, device), memory, deterministic)
             obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
             done = terminated | truncated
             agent.memory.reset(memory, torch.as_tensor(done))
@@ -100,7 +92,7 @@ def evaluate(
     return metrics | {"finished": 1.0 - playing}
 
 
-def level_scores(args: Any, agent: nn.Module, envs: VectorEnv) -> dict[str, Tensor]:
+def level_scores(args: RunArgs, agent: nn.Module, envs: VectorEnv) -> dict[str, Tensor]:
     """Return an evaluation's metrics by name, (--eval-levels, REPEATS) float64: every episode on every level.
 
     Training goes on as if there had been none, unless an environment of another package takes random numbers from

@@ -4,6 +4,8 @@ Shape letters: T steps of a rollout, N environments, B samples, S sequences, L s
 width of a recurrent layer, P hidden vectors of a sequence.
 """
 
+import math
+from collections import defaultdict
 from collections.abc import Callable
 
 import torch
@@ -128,3 +130,45 @@ class GRUScan(torch.autograd.Function):
         grad_bias = grad_hidden.sum(0)
         grad_hidden.chunk(3, -1)[2].copy_(grad_n)  # the inputs' gradient differs in n alone
         return grad_hidden, carried, grad_weight, grad_bias, None
+
+
+# ---- Muon in float32 ----
+class Muon(torch.optim.Muon):
+    """`torch.optim.Muon`, with all its matrices of one shape at once, and in float32, on a CPU.
+
+    The library orthogonalizes in bfloat16, for which most CPUs have no instructions. Its momentum is Nesterov's, its
+    rate that of adjust_lr_fn="match_rms_adamw", and it has one group of parameters; no other is needed here.
+    """
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:
+        """Make a step along the orthogonalized momentum of each matrix that has a gradient."""
+        (group,) = self.param_groups
+        weights = [weight for weight in group["params"] if weight.grad is not None]
+        if any(weight.device.type != "cpu" for weight in weights):
+            return super().step()
+        by_shape = defaultdict(list)
+        for weight in weights:
+            by_shape[weight.shape].append(weight)
+        for (rows, columns), members in by_shape.items():
+            directions = []
+            for weight in members:
+                momentum = self.state[weight].setdefault("momentum_buffer", torch.zeros_like(weight))
+                momentum.lerp_(weight.grad, 1 - group["momentum"])
+                directions.append(weight.grad.lerp(momentum, group["momentum"]))
+            steps = orthogonalize(torch.stack(directions), group["ns_coefficients"], group["ns_steps"])
+            rate = group["lr"] * 0.2 * math.sqrt(max(rows, columns))  # a step's root mean square is 0.2, as AdamW's
+            for weight, step in zip(members, steps, strict=True):
+                weight.mul_(1 - group["lr"] * group["weight_decay"]).sub_(step, alpha=rate)
+
+
+def orthogonalize(matrices: Tensor, coefficients: tuple[float, float, float], steps: int) -> Tensor:
+    """Return about the nearest orthogonal matrices to some (B, rows, columns), by Newton-Schulz iterations."""
+    a, b, c = coefficients
+    is_tall = matrices.shape[1] > matrices.shape[2]
+    x = matrices.mT if is_tall else matrices
+    x = x / torch.linalg.matrix_norm(x, keepdim=True).clamp(min=1e-7)  # no singular value is above 1
+    for _ in range(steps):
+        gram = x @ x.mT
+        x = a * x + torch.baddbmm(gram, gram, gram, beta=b, alpha=c) @ x
+    return x.mT if is_tall else x

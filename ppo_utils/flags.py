@@ -2,9 +2,12 @@
 
 import contextlib
 import shlex
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
+import torch
 import tyro
+from torch import nn
 from tyro.constructors import PrimitiveConstructorSpec
 
 from ppo_utils.processes import rank_and_size
@@ -60,6 +63,68 @@ NonNegativeFloat = bounded(float, 0, LARGEST)
 UnitInterval = bounded(float, 0, 1)
 
 
+@dataclass
+class RunArgs:
+    """What a script's Args begins with: flags of the run, its environments and evaluations, which it does not read.
+
+    Those of the algorithm follow in the script. Of these, this package reads total_timesteps, num_envs, num_steps,
+    num_minibatches, update_epochs, refresh_memory, anneal_steps, amp and the coefficients of auxiliary losses.
+    """
+
+    exp_name: str = ""
+    """name of the experiment, part of the run folder's name (default: the script's name)"""
+    preset: Literal["thesis", "laptop", "quickstart"] = "thesis"
+    """a set of defaults, listed above; explicit flags override it (in Python: Args(**PRESETS["laptop"]))"""
+    seed: NonNegativeInt = 1
+    """seed of weights, actions and environments; on a CPU with as many threads, a run is repeated bit for bit"""
+    cuda: bool = True
+    """train on the GPU if there is one"""
+    track: bool = False
+    """log to Weights and Biases too (extra `track`); WANDB_PROJECT and WANDB_ENTITY name project and team"""
+    capture_video: bool = False
+    """record some episodes of the first environment (extra `play`)"""
+    save_model: bool = False
+    """write model.pt to the run folder when training ends"""
+    load_model: str | None = None
+    """start from the weights in this model.pt or checkpoint; optimizer and step count start afresh"""
+    resume: str | None = None
+    """continue the run in this folder from its last checkpoint; only --total-timesteps may change, to a larger value"""
+    checkpoint_interval: NonNegativeInt = 50
+    """iterations between checkpoints, with another one at the end (0: no checkpoints); the last two are kept"""
+
+    env_id: str = "MortarMayhem-Grid-v0"
+    """any Gymnasium id with Discrete or MultiDiscrete actions; as module:id if importing a module registers it"""
+    env_options: str = "{}"
+    """reset options of a Memory Gym environment as JSON, e.g. '{"command_count": [4]}'"""
+    env_kwargs: str = "{}"
+    """constructor arguments of another package's environment as JSON, e.g. '{"size": 9}'"""
+    async_envs: bool = False
+    """train in environments that are each a process of their own, for slow ones of other packages"""
+    num_levels: NonNegativeInt = 100_000
+    """number of levels to train on (0: no limit); in environments of other packages, a level is a seed"""
+    start_level: NonNegativeInt = 0
+    """the first of these levels"""
+    obs_type: Literal["pixels", "grayscale", "vector"] = "pixels"
+    """what a Memory Gym environment shows: images in color or in gray, or vectors of what can be seen on them"""
+    frame_stack: NonNegativeInt = 0
+    """observe the last K images, in grayscale, or the last K vectors (0: the current one, in color)"""
+    step_encoding: bool = False
+    """also observe a sinusoidal encoding of the episode's step"""
+    observe_last_action: bool = False
+    """also observe the last action and the last reward"""
+    spotlight_perturbation: bool = False
+    """cover the image with a translucent white layer in which moving spotlights leave holes (thesis §7.2)"""
+    vector_frequencies: bounded(int, 0, 16) = 0
+    """also observe Fourier features of vectors with entries from 0 to 1, at this many frequencies"""
+
+    eval_interval: NonNegativeInt = 0
+    """iterations between evaluations on unseen levels, with another one at the end (0: no evaluations)"""
+    eval_levels: PositiveInt = 50
+    """number of levels of an evaluation, which follow those of the training; each is played three times"""
+    eval_max_steps: PositiveInt = 10_000
+    """an evaluation cuts episodes off after this many steps"""
+
+
 def flag(name: str) -> str:
     """Return the command line's spelling of a field of Args."""
     return "--" + name.replace("_", "-")
@@ -73,7 +138,7 @@ def as_flags(values: dict[str, Any]) -> str:
     )
 
 
-def check_bounds(args: Any) -> None:
+def check_bounds(args: RunArgs) -> None:
     """Raise ValueError, naming the flag and what it may be, for a dataclass' first number that is out of bounds."""
     for name, kind in get_type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
@@ -85,7 +150,7 @@ def check_bounds(args: Any) -> None:
             raise ValueError(f"{flag(name)} is {value}; it must be below 2 ** 63")
 
 
-def check_args(args: Any) -> None:
+def check_args(args: RunArgs) -> None:
     """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work.
 
     An integer that is given for a float in Python becomes one, so that logs spell both alike.
@@ -105,13 +170,12 @@ def check_args(args: Any) -> None:
         if is_choice and value not in get_args(kind):
             raise ValueError(f"{flag(name)} is {value!r}; it must be one of {', '.join(get_args(kind))}")
     check_bounds(args)
-    if not args.exp_name or set(args.exp_name) & set("/\\"):
+    if set(args.exp_name) & set("/\\"):
         raise ValueError(f"--exp-name is {args.exp_name!r}; it must be a name without slashes")
-    for name in ("reconstruction", "ground_truth"):
-        if getattr(args, f"{name}_detach") and not getattr(args, f"{name}_coef"):
-            raise ValueError(f"{flag(f'{name}_detach')} needs {flag(f'{name}_coef')} above 0")
-    if args.optimizer != "muon" and args.muon_lr_ratio != type(args).muon_lr_ratio:
-        raise ValueError(f"--muon-lr-ratio needs --optimizer muon; it is {args.optimizer}")
+    if args.auxiliary_detach and not (args.reconstruction_coef or args.ground_truth_coef):
+        raise ValueError("--auxiliary-detach needs --reconstruction-coef or --ground-truth-coef above 0")
+    if args.anneal_steps is None:
+        args.anneal_steps = args.total_timesteps
     if args.refresh_memory and args.update_epochs == 1:
         raise ValueError("--refresh-memory needs --update-epochs above 1: the first epoch has fresh memory")
     batch_size = args.num_envs * args.num_steps
@@ -124,8 +188,9 @@ def check_args(args: Any) -> None:
         raise ValueError(f"--num-envs is {args.num_envs}; it must be a multiple of the {rank_and_size()[1]} processes")
 
 
-def check_minibatches(args: Any, longest_piece: int) -> None:
-    """Raise ValueError if a minibatch could be empty; longest_piece: steps that a piece of a rollout may have."""
+def check_minibatches(args: RunArgs, agent: nn.Module) -> None:
+    """Raise ValueError if a minibatch could be empty, in a rollout in which no episode ends."""
+    longest_piece = int(agent.memory.cut(torch.zeros(args.num_steps, 1, dtype=torch.bool)).length.max())
     steps = args.num_envs * args.num_steps // rank_and_size()[1]
     if args.num_minibatches * longest_piece > steps:
         raise ValueError(

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from ppo_utils.errors import RunError
+from ppo_utils.flags import RunArgs
 from ppo_utils.lanes import OWN
 
 
-def ground_truth_of(infos: dict[str, Any], args: Any, before: np.ndarray | None = None) -> np.ndarray | None:
+def ground_truth_of(infos: dict[str, Any], args: RunArgs, before: np.ndarray | None = None) -> np.ndarray | None:
     """Return the ground truth (N, G) that --ground-truth-coef estimates, None where it is 0.
 
     before: that of the step before, if there is one. Raises RunError if an environment reports none, or other than G

@@ -1,18 +1,21 @@
 """What a run logs: to TensorBoard, to the progress bar, and with --track to Weights and Biases."""
 
 import contextlib
+import math
 from collections import defaultdict
 from dataclasses import asdict
-from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from ppo_utils.flags import RunArgs
 from ppo_utils.run import Run
 
 
-def open_logs(args: Any, run: Run) -> None:
+def open_logs(args: RunArgs, run: Run) -> None:
     """Open a TensorBoard file, which hides older entries beyond the run's step, and the progress bar."""
     run.writer = SummaryWriter(str(run.folder), purge_step=run.step + 1 if run.step else None)
     hyperparameters = {"script": run.script, **asdict(args)}
@@ -23,7 +26,7 @@ def open_logs(args: Any, run: Run) -> None:
     run.bar = tqdm(total=total, initial=run.step, unit=" steps", unit_scale=True)
 
 
-def start_tracking(args: Any, name: str) -> None:
+def start_tracking(args: RunArgs, name: str) -> None:
     """Mirror the TensorBoard curves to Weights and Biases; its environment variables name the project and the team.
 
     Raises ValueError if that does not start, ImportError without the extra `track`.
@@ -37,6 +40,29 @@ def start_tracking(args: Any, name: str) -> None:
         wandb.init(name=name, id=name, config=asdict(args), **how)
     except Exception as error:  # whatever wandb raises: no account, no such team, no network
         raise ValueError(f"--track: {error}; log in with `wandb login`, or leave --track out") from None
+
+
+def mean_logs(step_logs: list[dict[str, Tensor]], values: Tensor, returns: Tensor) -> dict[str, float]:
+    """Return the means of what an update logged of its minibatches; values and returns (T, N) are the rollout's.
+
+    The minibatch at which --target-kl ended the update has no gradient norm. Raises FloatingPointError if a loss or a
+    gradient was not finite: the weights are unusable then.
+    """
+    logged = {name: [logs[name] for logs in step_logs if name in logs] for name in step_logs[0]}
+    losses = {name: torch.stack(each).mean().item() for name, each in logged.items()}
+    if not (math.isfinite(losses["loss"]) and math.isfinite(losses["grad_norm"])):
+        raise FloatingPointError("the loss or its gradient is not finite; try a lower --init-lr, or smaller rewards")
+    # Before the first gradient step, ratios differ from 1 by rounding only, if the update recomputes what acted.
+    losses["ratio_error"] = step_logs[0]["ratio_error"].item()
+    losses["explained_variance"] = explained_variance(values, returns)
+    gradient_steps = len(logged["grad_norm"])
+    return {f"losses/{name}": value for name, value in losses.items()} | {"charts/gradient_steps": gradient_steps}
+
+
+def explained_variance(values: Tensor, returns: Tensor) -> float:
+    """Return the share of the returns' variance that the values explain; NaN if the returns do not vary."""
+    variance = returns.var().item()
+    return 1 - (returns - values).var().item() / variance if variance > 0 else math.nan
 
 
 def combine_logs(parts: list[tuple[dict, dict]]) -> tuple[dict[str, float], dict[str, list[float]]]:
@@ -54,7 +80,7 @@ def combine_logs(parts: list[tuple[dict, dict]]) -> tuple[dict[str, float], dict
     return combined, joined
 
 
-def write_logs(args: Any, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
+def write_logs(args: RunArgs, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
     """Write an iteration's numbers to TensorBoard and the progress bar; the first process does."""
     run.seconds += logs["charts/seconds_iteration"]
     run.returns.extend(episodes.get("charts/episodic_return", []))

@@ -1,4 +1,7 @@
-"""What a training run consists of, from its environments to its progress bar."""
+"""What a training run consists of, from its environments to its progress bar.
+
+Shape letters: T steps of a rollout, N environments.
+"""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -11,16 +14,21 @@ from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from ppo_utils.moments import ReturnScale
+
 
 @dataclass
 class Run:
-    """All that training needs, made by a script's `setup`."""
+    """All that training needs, made by `prepare`, a script's `setup` and `open_run`."""
 
     script: str  # the name of the script
+    device: torch.device
+    checkpoint: dict[str, Any] | None  # that --resume goes on from
     envs: gym.vector.VectorEnv
-    agent: nn.Module
-    optimizers: list[torch.optim.Optimizer]
-    rollout: Any  # a script's Rollout
+    agent: nn.Module | None = None
+    optimizers: list[torch.optim.Optimizer] = field(default_factory=list)
+    carry: Any = None  # a script's Carry, what the next rollout goes on with
+    return_scale: ReturnScale = field(default_factory=ReturnScale)  # for --norm-reward
     folder: Path = Path()  # named by `open_run`
     eval_envs: gym.vector.VectorEnv | None = None
     lock: IO | None = None  # a locked file, which tells other processes that the folder is in use

@@ -40,10 +40,10 @@ from ppo_utils.checkpoints import (
     saved_args,
     write_file,
 )
-from ppo_utils.environments import envs_for
+from ppo_utils.environments import envs_for, training_envs
 from ppo_utils.errors import LaneError, RunError
 from ppo_utils.evaluation import REPEATS, level_scores
-from ppo_utils.flags import as_flags, check_args, check_minibatches, flag
+from ppo_utils.flags import RunArgs, as_flags, check_args, check_minibatches, flag
 from ppo_utils.logs import combine_logs, open_logs, start_tracking, write_logs
 from ppo_utils.processes import all_gather, join_processes, leave_processes, rank_and_size, seed_generators
 from ppo_utils.run import Run
@@ -70,30 +70,35 @@ def parse_args(kind: type[T], presets: dict[str, dict[str, Any]], argv: list[str
     return tyro.cli(kind, args=argv, default=default, description="\n\n".join([kind.__doc__, *lines]))
 
 
-def prepare(args: Any, script: str, longest_piece: int) -> tuple[torch.device, dict[str, Any] | None]:
-    """Check the arguments, join other processes and seed the generators; return the device and --resume's checkpoint.
+def prepare(args: RunArgs, script: str) -> tuple[Run, dict[str, np.ndarray], dict[str, Any]]:
+    """Check the arguments, join other processes, seed the generators, and make and reset the environments.
 
-    longest_piece: the largest number of steps in a piece; minibatches are made of pieces. Raises ValueError, OSError,
-    ImportError or gymnasium.error.Error, each with one line for the user.
+    Returns the run, which a script completes, the first observations and infos. Raises ValueError, OSError,
+    ImportError, RunError or gymnasium.error.Error, each with one line for the user.
     """
     if not re.fullmatch(SCRIPT_NAME, script):
         raise ValueError(
             f"the script {script}.py must be named ppo_NAME.py, in letters, digits and _, to be found again"
         )
+    args.exp_name = args.exp_name or script
     join_processes()
     checkpoint = None if args.resume is None else read_checkpoint(args.resume)
     if checkpoint is not None:
         check_resumed(args, checkpoint, script)
     check_args(args)
-    check_minibatches(args, longest_piece)
     if args.capture_video:
         check_can_film(args.env_id)
     seed_process(args, checkpoint)
-    torch.backends.cudnn.deterministic = args.torch_deterministic
-    if not (torch.cuda.is_available() and args.cuda):
-        return torch.device("cpu"), checkpoint
-    torch.set_float32_matmul_precision("high")  # TF32
-    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0))), checkpoint
+    device = torch.device("cpu")
+    if torch.cuda.is_available() and args.cuda:
+        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+        torch.backends.cudnn.deterministic = True
+        torch.set_float32_matmul_precision("high")  # TF32
+    with report_out_of_memory(args, device):
+        envs = training_envs(args, checkpoint)
+    with report_out_of_memory(args, device, envs.single_observation_space):
+        obs, infos = envs.reset()
+    return Run(script, device, checkpoint, envs), obs, infos
 
 
 def seed_process(args: Any, checkpoint: dict[str, Any] | None) -> None:
@@ -111,7 +116,7 @@ def seed_process(args: Any, checkpoint: dict[str, Any] | None) -> None:
 
 @contextlib.contextmanager
 def report_out_of_memory(
-    args: Any, device: torch.device, space: gym.spaces.Dict | None = None, more: str | None = None
+    args: RunArgs, device: torch.device, space: gym.spaces.Dict | None = None, more: str | None = None
 ) -> Iterator[None]:
     """Raise RunError if what is made inside does not fit in the memory, naming what is large.
 
@@ -137,12 +142,13 @@ def report_out_of_memory(
         raise RunError(f"this does not fit in the memory of {device}; use less of {large}") from None
 
 
-def open_run(args: Any, run: Run, checkpoint: dict[str, Any] | None) -> Run:
+def open_run(args: RunArgs, run: Run) -> Run:
     """Load what --resume or --load-model names, and open the run's files, the last thing that a setup does.
 
     run.folder is named here. Raises ValueError, OSError, ImportError or RunError, each with one line for the user.
     """
-    rank, _ = rank_and_size()
+    check_minibatches(args, run.agent)
+    rank, checkpoint = rank_and_size()[0], run.checkpoint
     if args.eval_interval and rank == 0:
         with report_out_of_memory(args, torch.device("cpu")):
             run.eval_envs = envs_for(args, args.eval_levels * REPEATS, asynchronous=False)
@@ -157,12 +163,13 @@ def open_run(args: Any, run: Run, checkpoint: dict[str, Any] | None) -> Run:
     run.folder = all_gather(run.folder)[0]
     if checkpoint is not None:
         load_process(run, checkpoint)
+        run.checkpoint = None  # which holds much that is not needed any more
     if rank == 0:
         open_logs(args, run)
     return run
 
 
-def open_folder(args: Any, run: Run) -> None:
+def open_folder(args: RunArgs, run: Run) -> None:
     """Make a run folder, or take over the one of --resume, and record videos with --capture-video.
 
     Raises OSError if it cannot be written or is in use, or as `start_tracking` does.
@@ -194,7 +201,7 @@ def open_folder(args: Any, run: Run) -> None:
         run.envs = LaneVideo(run.envs, str(run.folder / (f"videos-{run.step}" if run.step else "videos")))
 
 
-def make_folder(args: Any) -> Path:
+def make_folder(args: RunArgs) -> Path:
     """Make a run folder; runs of the same name that begin in the same second get a number. Raises OSError."""
     name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
     first = Path("runs") / re.sub(r'[<>:"/\\|?*\x00-\x1f]', "-", name)  # what a name may not have in Windows
@@ -219,7 +226,7 @@ def report_failed_write(folder: Path) -> Iterator[None]:
         raise RunError(f"cannot write to {error.filename or folder} ({error.strerror})") from error
 
 
-def end_iteration(args: Any, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
+def end_iteration(args: RunArgs, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
     """End an iteration: evaluate, log, and save, each where it is due.
 
     logs need charts/seconds_iteration, the time that the iteration took. Raises RunError if a file cannot be written or
@@ -261,7 +268,7 @@ def stop_on_signals(run: Run) -> None:
 
 
 # ---- to the end ----
-def run_to_end(args: Any, run: Run, train: Callable[[Any, Run], None]) -> Path:
+def run_to_end(args: RunArgs, run: Run, train: Callable[[Any, Run], None]) -> Path:
     """Train until it is done or stopped; return the run folder.
 
     With --save-model, what was learned is kept, unless the training diverged, it needed too much memory, a file could
@@ -270,7 +277,7 @@ def run_to_end(args: Any, run: Run, train: Callable[[Any, Run], None]) -> Path:
     """
     save_model, interrupt = args.save_model, None
     try:
-        with report_out_of_memory(args, run.rollout.values.device, more="num_minibatches"):
+        with report_out_of_memory(args, run.device, more="num_minibatches"):
             train(args, run)
         if run.writer is not None:
             with report_failed_write(run.folder):
@@ -296,7 +303,7 @@ def run_to_end(args: Any, run: Run, train: Callable[[Any, Run], None]) -> Path:
     return run.folder
 
 
-def summary(args: Any, run: Run) -> str:
+def summary(args: RunArgs, run: Run) -> str:
     """Return the lines that a training ends with: what it reached, and the commands to go on with."""
     score = "no episode ended"
     if run.scores:
