@@ -11,11 +11,12 @@ Shape letters: T steps of the episode, A action branches, K blocks, H heads, M e
 """
 
 import base64
+import contextlib
 import io
 import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -144,7 +145,7 @@ class Episode:
     rewards: list[float] = field(default_factory=list)  # T
     truth: list[np.ndarray] = field(default_factory=list)  # T x (G,); empty where the environment tells none
     estimate: list[np.ndarray] = field(default_factory=list)  # T x (G,); empty without an estimator
-    attention: list[np.ndarray] = field(default_factory=list)  # T x (K, H, M or fewer), the oldest step first
+    attention: list[list[np.ndarray]] = field(default_factory=list)  # T x K x (H, M or fewer), the oldest step first
     events: dict[str, list[int]] = field(default_factory=dict)  # the steps of each, by its name
     finished: bool = False  # not cut short
     stacked: bool = False  # its images are stacks of grayscale ones
@@ -176,7 +177,7 @@ def play(
     if family:
         episode.events = {family.shown: [], family.rewarded: [], "failure": []}
     obs, infos = envs.reset(seed=seed)
-    memory = agent.memory.initial_state(1, max_steps, torch.device("cpu"))
+    memory = agent.memory.begin_rollout(agent.memory.initial(1, torch.device("cpu")), max_steps)
     while not episode.finished and len(episode.actions) < max_steps:
         for name, frame in views(envs, obs, stacked).items():
             episode.film(name, frame)
@@ -185,7 +186,10 @@ def play(
         step = len(episode.actions)
         if family and family.shows(envs.unwrapped.state):
             episode.events[family.shown].append(step)
-        actions = act(agent, as_tensors(obs, torch.device("cpu")), memory, episode, deterministic)
+        with watching(agent, episode):
+            now = as_tensors(obs, torch.device("cpu"))
+            actions, *_ = agent.get_action_and_value(now, memory, deterministic)
+        episode.actions.append(actions[0].tolist())
         obs, rewards, terminated, truncated, infos = envs.step(actions.numpy())
         episode.rewards.append(float(rewards[0]))
         if family and (rewards[0] > 0 or terminated[0]):
@@ -196,39 +200,34 @@ def play(
     return episode
 
 
-def act(agent: nn.Module, obs: dict[str, Tensor], memory: Any, episode: Episode, deterministic: bool) -> Tensor:
-    """Return actions (1, A), as `evaluation.act` does; add what was computed to the episode."""
-    x = agent.encoder(obs)
-    y, stored = agent.memory.step(memory, x)
-    if hasattr(agent.memory, "attended_rows"):  # a transformer
-        episode.attention.append(attention_of(agent.memory, memory, x)[0].numpy())
-    agent.memory.advance(memory, stored)
-    policy, values, features = agent.heads(y)
-    actions = torch.stack([branch.logits.argmax(-1) if deterministic else branch.sample() for branch in policy], -1)
-    episode.policy.append([branch.probs[0].numpy() for branch in policy])
-    episode.actions.append(actions[0].tolist())
-    episode.values.append(values.item())
-    episode.entropies.append(sum(branch.entropy().item() for branch in policy))
-    if agent.decoder is not None:
-        episode.film(RECONSTRUCTION, displayable(agent.decoder(features).sigmoid()[0].numpy(), episode.stacked))
-    if agent.estimator is not None:
-        episode.estimate.append(agent.estimator(features)[0].numpy())
-    return actions
+@contextlib.contextmanager
+def watching(agent: nn.Module, episode: Episode) -> Iterator[None]:
+    """Add to the episode what the agent's heads, and a transformer's attention, compute at each step of one lane."""
 
+    def add_outputs(_: nn.Module, given: Any, outputs: tuple) -> None:
+        policy, values, features = outputs
+        episode.policy.append([branch.probs[0].numpy() for branch in policy])
+        episode.values.append(values.item())
+        episode.entropies.append(sum(branch.entropy().item() for branch in policy))
+        if agent.decoder is not None:
+            episode.film(RECONSTRUCTION, displayable(agent.decoder(features).sigmoid()[0].numpy(), episode.stacked))
+        if agent.estimator is not None:
+            episode.estimate.append(agent.estimator(features)[0].numpy())
 
-def attention_of(memory: nn.Module, state: Any, x: Tensor) -> Tensor:
-    """Return what the next step, x (N, D), attends to: weights (N, K, H, M) of the last M steps, the oldest first.
+    def add_weights(attention: nn.Module, given: tuple, _: Tensor) -> None:
+        x, keys, _, age, mask = given
+        weights.append(attention_weights(attention, x, keys, age, mask)[0, :, 0].numpy())  # (H, M)
 
-    memory, state: a transformer's Memory and MemoryState, as in ppo_trxl.py.
-    """
-    rows, age, mask = memory.attended_rows(state)
-    x, found = x[:, None], []  # (N, 1, D)
-    query = memory.first_query(x, state.episode_step[:, None], state.hidden[state.now - 1, :, -1:])
-    for k, block in enumerate(memory.blocks):
-        keys_values = state.keys[k][:, rows], state.values[k][:, rows]
-        found.append(attention_weights(block.attention, block.norm_query(query), keys_values[0], age, mask)[:, :, 0])
-        x = query = block(x, query, keys_values, age, mask)
-    return torch.stack(found, 1)
+    weights = []
+    hooks = [agent.heads.register_forward_hook(add_outputs)]
+    hooks += [block.attention.register_forward_hook(add_weights) for block in getattr(agent.memory, "blocks", ())]
+    try:
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
+    if weights:
+        episode.attention.append(weights)
 
 
 def attention_weights(attention: nn.Module, x: Tensor, keys: Tensor, age: Tensor, mask: Tensor) -> Tensor:
@@ -333,11 +332,11 @@ def packed(attention: list[np.ndarray]) -> dict[str, Any] | None:
     """
     if not attention:
         return None
-    blocks, heads, _ = attention[0].shape
-    window = max(each.shape[2] for each in attention)
+    blocks, heads = len(attention[0]), len(attention[0][0])
+    window = max(each[0].shape[1] for each in attention)
     weights = np.zeros((len(attention), blocks, heads, window), np.uint8)
     for step, each in enumerate(attention):
-        weights[step, :, :, window - each.shape[2] :] = (np.sqrt(each) * 255).round()
+        weights[step, :, :, window - each[0].shape[1] :] = (np.sqrt(each) * 255).round()
     return {"blocks": blocks, "heads": heads, "window": window, "weights": base64.b64encode(weights.tobytes()).decode()}
 
 
@@ -419,7 +418,7 @@ def memory_of(args: Any) -> str:
         parts += [f"{encoding} positional encoding", f"{args.trxl_layer_norm}-norm"]
     else:
         parts = [args.exp_name]
-    flags = {name: getattr(args, name, False) for name in ("trxl_query_position", "trxl_query_output")}
+    flags = {name: getattr(args, name, False) for name in ("trxl_query_position",)}
     for name, value in (flags | wrappers_of(args)).items():
         if value:
             parts.append(name.removeprefix("trxl_").replace("_", " ") + (f" {value}" if value is not True else ""))

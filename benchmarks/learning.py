@@ -165,7 +165,7 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
         parsed = parse(script, *flags)
         args = replace(parsed, seed=seed)
         check_args(args)
-        check_minibatches(args, module.Memory.longest_piece(args))
+        check_minibatches(args, module.Memory(args, module.Memory.input_width(args)))
     except (ValueError, OSError) as error:
         raise SystemExit(f"{agent}: {error}") from None
     theirs = {each: getattr(args, each) for each in of_the_suite}

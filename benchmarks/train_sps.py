@@ -93,7 +93,7 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, in
     args.checkpoint_interval = 0
     short = replace(args, num_steps=32)
     run = script.setup(args)
-    device = run.rollout.values.device
+    device = run.device
     cnn = script.AtariCNN(3)
     encoder = torch.nn.Sequential(cnn, torch.nn.Linear(3136, run.agent.memory.width), torch.nn.ReLU())
     trials = {chunk: bound_iteration(cnn, short, device, chunk) for chunk in config.chunks}

@@ -53,11 +53,12 @@ def kept_for_backward(run, args: ppo_trxl.Args) -> list[torch.Tensor]:
         kept.append(tensor)
         return tensor
 
-    memory, rollout = run.agent.memory, run.rollout
+    memory = run.agent.memory
+    rollout, *_ = ppo_trxl.collect(run.agent, run.envs, run.carry, args)
     minibatch = next(memory.cut(rollout.done).minibatches(args.num_minibatches))
     x = torch.randn(int(minibatch.length.sum()), memory.width, requires_grad=True)
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        memory.unroll(rollout.memory_state, x, minibatch)
+        memory.unroll(rollout.memory, x, minibatch)
     weights = {parameter.untyped_storage().data_ptr() for parameter in memory.parameters()}
     return [tensor for tensor in kept if tensor.untyped_storage().data_ptr() not in weights]
 
@@ -71,13 +72,14 @@ def shares(config: Config) -> None:
     run = ppo_trxl.setup(args)
     ppo_trxl.train(args, run)
     resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6  # kilobytes on Linux
+    memory = run.agent.memory.begin_rollout(run.carry.memory, args.num_steps)
+    kept = kept_for_backward(run, args)
     close(run)
-    memory = run.rollout.memory_state
     rows = {
         "highest resident memory, all in all": resident,
         "stored hidden states": megabytes([memory.hidden, memory.row_step]),
-        "cache of keys and values": megabytes([memory.keys, memory.values]),
-        "kept of a minibatch for the backward pass": megabytes(kept_for_backward(run, args)),
+        "cache of keys and values": megabytes([*memory.keys, *memory.values]),
+        "kept of a minibatch for the backward pass": megabytes(kept),
     }
     print(f"{config.env_id}, 32 x {config.num_steps}, window {args.trxl_memory_length}\n\n| memory | MB |\n|---|---:|")
     for name, size in rows.items():
@@ -89,8 +91,8 @@ def step_times(config: Config, window: int) -> tuple[float, float]:
     """Return the median seconds of a step of the memory with a full window, and of its attention alone."""
     args = ppo_trxl.Args(trxl_memory_length=window, num_steps=config.repeats)
     memory = ppo_trxl.Memory(args, args.trxl_dim)
-    state = memory.initial_state(args.num_envs, args.num_steps, torch.device("cpu"))
-    state.episode_step.add_(window)
+    fresh = memory.initial(args.num_envs, torch.device("cpu"))
+    state = memory.begin_rollout(fresh | {"episode_step": fresh["episode_step"] + window}, args.num_steps)
     x = torch.randn(args.num_envs, memory.width)
     split = memory.blocks[0].attention.split
     step, attention = [], []
@@ -99,7 +101,8 @@ def step_times(config: Config, window: int) -> tuple[float, float]:
         _, hidden = memory.step(state, x)
         memory.advance(state, hidden)
         step.append(time.perf_counter() - start)
-        rows, _, mask = memory.attended_rows(state)
+        key_columns, _, mask = ppo_trxl.attended_keys(state.episode_step[:, None], window, x.device)
+        rows = slice(state.now - len(key_columns), state.now)
         start = time.perf_counter()
         for keys, values in zip(state.keys, state.values, strict=True):
             F.scaled_dot_product_attention(

@@ -188,9 +188,9 @@ def check_args(args: RunArgs) -> None:
         raise ValueError(f"--num-envs is {args.num_envs}; it must be a multiple of the {rank_and_size()[1]} processes")
 
 
-def check_minibatches(args: RunArgs, agent: nn.Module) -> None:
+def check_minibatches(args: RunArgs, memory: nn.Module) -> None:
     """Raise ValueError if a minibatch could be empty, in a rollout in which no episode ends."""
-    longest_piece = int(agent.memory.cut(torch.zeros(args.num_steps, 1, dtype=torch.bool)).length.max())
+    longest_piece = int(memory.cut(torch.zeros(args.num_steps, 1, dtype=torch.bool)).length.max())
     steps = args.num_envs * args.num_steps // rank_and_size()[1]
     if args.num_minibatches * longest_piece > steps:
         raise ValueError(

@@ -89,10 +89,10 @@ def prepare(args: RunArgs, script: str) -> tuple[Run, dict[str, np.ndarray], dic
     if args.capture_video:
         check_can_film(args.env_id)
     seed_process(args, checkpoint)
+    torch.backends.cudnn.deterministic = True
     device = torch.device("cpu")
     if torch.cuda.is_available() and args.cuda:
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
-        torch.backends.cudnn.deterministic = True
         torch.set_float32_matmul_precision("high")  # TF32
     with report_out_of_memory(args, device):
         envs = training_envs(args, checkpoint)
@@ -101,7 +101,7 @@ def prepare(args: RunArgs, script: str) -> tuple[Run, dict[str, np.ndarray], dic
     return Run(script, device, checkpoint, envs), obs, infos
 
 
-def seed_process(args: Any, checkpoint: dict[str, Any] | None) -> None:
+def seed_process(args: RunArgs, checkpoint: dict[str, Any] | None) -> None:
     """Seed torch's generator, for the weights, and those of NumPy and Python, for environments of other packages.
 
     All processes begin with the same weights. Environments of another process, and those of a run that goes on, which
@@ -147,7 +147,7 @@ def open_run(args: RunArgs, run: Run) -> Run:
 
     run.folder is named here. Raises ValueError, OSError, ImportError or RunError, each with one line for the user.
     """
-    check_minibatches(args, run.agent)
+    check_minibatches(args, run.agent.memory)
     rank, checkpoint = rank_and_size()[0], run.checkpoint
     if args.eval_interval and rank == 0:
         with report_out_of_memory(args, torch.device("cpu")):

@@ -54,6 +54,12 @@ def parse_args(script, *flags):
     return runs.parse_args(script.Args, script.PRESETS, [*flags])
 
 
+def collect(script, run, args):
+    """Play a rollout, and keep it in run.rollout; return the metrics of its episodes."""
+    run.rollout, run.carry, episodes = script.collect(run.agent, run.envs, run.carry, args)
+    return episodes
+
+
 @pytest.fixture(scope="session")
 def tiny():
     """Arguments of a script for a training of two short iterations; keyword arguments replace some of them."""
@@ -115,7 +121,7 @@ def opened():
 @pytest.fixture
 def played(tiny, opened):
     """Set up an agent and play some rollouts, without learning; the last one stays in run.rollout, its
-    advantages and returns are zeros."""
+    advantages and returns are zeros. Returns its last value too, and the metrics of its episodes."""
 
     def play(iterations=1, weights_scale=1.0, script=ppo_gru, **changes):
         args = tiny(script, **changes)
@@ -124,8 +130,8 @@ def played(tiny, opened):
             for parameter in run.agent.heads.parameters():
                 parameter.mul_(weights_scale)
         for _ in range(iterations):
-            last_value, episodes = script.collect(run.agent, run.envs, run.rollout, args)
+            episodes = collect(script, run, args)
         run.rollout.advantages, run.rollout.returns = run.rollout.values.new_zeros(2, *run.rollout.values.shape)
-        return args, run, last_value, episodes
+        return args, run, run.rollout.last_value, episodes
 
     return play

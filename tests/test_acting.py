@@ -98,7 +98,7 @@ def code_of(page):
 @pytest.mark.parametrize(("script", "changes"), [
     (ppo_gru, {}), (ppo_gru, {"num_layers": 2}), (ppo_gru, {"memory": "lstm"}), (ppo_trxl, {}),
     (ppo_trxl, {"trxl_positional_encoding": "relative"}), (ppo_trxl, {"trxl_positional_encoding": "learned"}),
-    (ppo_trxl, {"trxl_gate": "gru", "trxl_query_output": True, "trxl_query_position": True, "trxl_layer_norm": "post"}),
+    (ppo_trxl, {"trxl_gate": "gru", "trxl_query_position": True, "trxl_layer_norm": "post"}),
 ])  # fmt: skip
 def test_a_step_is_exported_as_documented(trained, script, changes, monkeypatch):
     """Over 20 steps of two episodes, a window of 7 included: the agent's own logits and values, to 1e-6."""
@@ -106,7 +106,7 @@ def test_a_step_is_exported_as_documented(trained, script, changes, monkeypatch)
     names = {"path": str(trained(script, 1, env_id="MysteryPath-Grid-v0", **changes))}
     exec("\n".join([load, gru if script is ppo_gru else trxl, export]), names)
     agent, step, state = names["player"].agent, names["exported"].module(), names["beginning"]
-    memory = agent.memory.initial_state(1, 64, torch.device("cpu"))
+    memory = agent.memory.begin_rollout(agent.memory.initial(1, torch.device("cpu")), 64)
     envs = envs_for(names["player"].args, 1)
     obs, _ = envs.reset(seed=1)
     for t in range(40):

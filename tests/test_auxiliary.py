@@ -59,7 +59,7 @@ def test_the_losses_are_means_over_real_steps(played, script):
     obs = {name: part.flatten(0, 1)[order] for name, part in run.rollout.obs.items()}
     with torch.no_grad():
         actions = run.rollout.actions.flatten(0, 1)[order]
-        features = run.agent.evaluate_actions(run.agent.encoder(obs), actions, pieces, run.rollout.memory_state)[3]
+        features = run.agent.evaluate_actions(run.agent.encoder(obs), actions, pieces, run.rollout.memory)[3]
         drawn = torch.sigmoid(run.agent.decoder(features))
         wanted = obs["visual_observation"] / 255
         truths = run.rollout.ground_truth.flatten(0, 1)[order]
@@ -89,7 +89,7 @@ def test_a_probe_teaches_nobody_else(played, script, name, part):
     changes = {"script": script, "env_id": "MortarMayhem-Grid-v0", f"{name}_coef": 10.0}
     found = {}
     for detach in (False, True):
-        args, run, *_ = played(**changes, **{f"{name}_detach": detach})
+        args, run, *_ = played(**changes, **{"auxiliary_detach": detach})
         found[detach] = loss_of(script, args, run)[2]
     args, run, *_ = played(script=script, env_id="MortarMayhem-Grid-v0")
     without = loss_of(script, args, run)[2]
@@ -104,7 +104,7 @@ def test_a_probe_teaches_nobody_else(played, script, name, part):
 def test_a_run_with_a_probe_is_the_run_without(tiny, curves, script, name, part):
     """To the last bit, however much the probe's loss weighs: the gradient's clipping does not see it."""
     args = tiny(script, env_id="MortarMayhem-Grid-v0", exp_name="without")
-    probe = {f"{name}_detach": True, f"{name}_coef": 100.0}
+    probe = {"auxiliary_detach": True, f"{name}_coef": 100.0}
     without = curves(script.main(args))
     probed = curves(script.main(dataclasses.replace(args, exp_name="probed", **probe)))
     assert probed[f"losses/{name}_loss"][0][1] > 0

@@ -8,7 +8,7 @@ import re
 import subprocess
 import sys
 import types
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -54,9 +54,7 @@ CASES = {
     "--env-id CueRecall-v0 --capture-video": "needs an environment that draws images .*; CueRecall-v0 draws none",
     "--target-kl nan": "--target-kl is nan; it must be above 0",
     "--vf-coef inf": "--vf-coef is inf; it must be 0 or more",
-    "--muon-lr-ratio inf": "--muon-lr-ratio is inf; it must be above 0 and at most 1000",
     "--ground-truth-detach": "--ground-truth-detach needs --ground-truth-coef above 0",
-    "--optimizer adamw --muon-lr-ratio 5": "--muon-lr-ratio needs --optimizer muon; it is adamw",
     "--refresh-memory --update-epochs 1": "--refresh-memory needs --update-epochs above 1: the first epoch has fresh "
     "memory",
     "--memory none --seq-len 5": "--seq-len, --num-layers and --refresh-memory need --memory gru or lstm",
@@ -154,7 +152,15 @@ def test_a_file_system_without_locks(tiny, opened, monkeypatch, number):
 
 def test_as_many_minibatches_as_steps_without_memory(tiny):
     args = tiny(memory="none", num_minibatches=64)
-    check_minibatches(args, ppo_gru.Memory.longest_piece(args))
+    check_minibatches(args, ppo_gru.Memory(args, 8))
+
+
+def test_a_piece_is_no_longer_than_the_rollout(tiny):
+    """Sequences may be longer: the limit is that of the pieces that a rollout has."""
+    args = tiny(seq_len=1000, num_minibatches=4)
+    check_minibatches(args, ppo_gru.Memory(args, 8))
+    with pytest.raises(ValueError, match="--num-minibatches is 5, but an iteration may have only 4"):
+        check_minibatches(replace(args, num_minibatches=5), ppo_gru.Memory(args, 8))
 
 
 @pytest.mark.parametrize("error", [RuntimeError("not enough memory: you tried to allocate a lot"), MemoryError()])
@@ -328,7 +334,7 @@ def test_an_integer_becomes_a_float_and_none_is_optional(tiny, changes, found):
 def test_a_script_that_its_files_could_not_name(tiny, name):
     """Before it trains: its models would be read by nothing."""
     with pytest.raises(ValueError, match=re.escape(f"the script {name}.py must be named ppo_NAME.py, in letters, ")):
-        runs.prepare(tiny(), name, 8)
+        runs.prepare(tiny(), name)
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

@@ -207,7 +207,7 @@ def test_command(page, command):
         with patch.object(flags, "rank_and_size", lambda: (0, processes)):
             args = parse_training(module, arguments)
             flags.check_args(args)
-            flags.check_minibatches(args, module.Memory.longest_piece(args))
+            flags.check_minibatches(args, module.Memory(args, module.Memory.input_width(args)))
 
 
 DRAWN = sorted({call for _, call in COMMANDS.values() if "learning.py" in call and "--results benchmarks/res" in call})

@@ -32,7 +32,7 @@ import ppo_trxl
 from memory_gym_envs.character import PAD
 from memory_gym_envs.mystery_path.state import ROWS
 from ppo_utils.environments import as_tensors, envs_for, is_memory_gym
-from ppo_utils.evaluation import act, make_agent
+from ppo_utils.evaluation import make_agent
 
 AGENTS = {
     "GRU": (ppo_gru, {"env_id": "MysteryPath-Grid-v0", "reconstruction_coef": 0.1, "ground_truth_coef": 0.1}),
@@ -120,7 +120,7 @@ def test_every_kind_of_agent(name, saved):
         assert len(branch["actions"]) == len(branch["probabilities"][0])
 
 
-@pytest.mark.parametrize("flags", [{}, {"trxl_query_output": True, "trxl_query_position": True}], ids=str)
+@pytest.mark.parametrize("flags", [{}, {"trxl_query_position": True}], ids=str)
 def test_the_episode_is_the_agents(flags, saved, monkeypatch):
     """Played again with the agent's own `act`: the same pictures, numbers and attention, step for step."""
     saved(ppo_trxl, env_id="MortarMayhem-Grid-v0", **flags)
@@ -137,7 +137,7 @@ def test_the_episode_is_the_agents(flags, saved, monkeypatch):
     monkeypatch.setattr(ppo_trxl.Attention, "forward", noted)
     torch.manual_seed(3)
     obs, infos = envs.reset(seed=3)
-    memory, cpu = agent.memory.initial_state(1, 60, torch.device("cpu")), torch.device("cpu")
+    memory, cpu = agent.memory.begin_rollout(agent.memory.initial(1, torch.device("cpu")), 60), torch.device("cpu")
     for t, actions in enumerate(episode.actions):
         assert np.array_equal(view[t], obs["observation"][0])
         envs.unwrapped.render_mode = "debug_rgb_array"
@@ -223,10 +223,11 @@ def test_most_probable_actions(saved):
     (page,) = page_of(deterministic=True, max_steps=40)["episodes"]
     agent, envs, _ = enjoy.load("model.pt")
     obs, _ = envs.reset(seed=3)
-    memory = agent.memory.initial_state(1, 40, torch.device("cpu"))
-    for t, actions in enumerate(page["actions"]):
+    memory = agent.memory.begin_rollout(agent.memory.initial(1, torch.device("cpu")), 40)
+    for actions in page["actions"]:
         with torch.no_grad():
-            assert act(agent, as_tensors(obs, torch.device("cpu")), memory, t, True).tolist() == [actions]
+            taken, *_ = agent.get_action_and_value(as_tensors(obs, torch.device("cpu")), memory, True)
+        assert taken.tolist() == [actions]
         obs, *_ = envs.step(np.array([actions]))
     assert page["facts"]["actions"] == "most probable"
     assert page_of(max_steps=40)["episodes"][0]["actions"] != page["actions"]

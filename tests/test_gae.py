@@ -13,12 +13,12 @@ def advantages(terminated=(), truncated=(), truncation_values=(0, 0, 0), rewards
     ends[0, list(terminated)] = True
     ends[1, list(truncated)] = True
     rollout = SimpleNamespace(
-        rewards=torch.tensor(rewards)[:, None],
+        last_value=torch.tensor([10.0]),
         values=torch.tensor([[4.0], [6.0], [8.0]]),
         done=ends[0] | ends[1],
         truncation_values=torch.tensor(truncation_values, dtype=torch.float32)[:, None],
     )
-    return gae(rollout, torch.tensor([10.0]), 0.5, 0.5)[:, 0].tolist()
+    return gae(torch.tensor(rewards)[:, None], rollout, 0.5, 0.5)[:, 0].tolist()
 
 
 # Deltas without an end: 1 + 3 - 4 = 0, 2 + 4 - 6 = 0, 3 + 5 - 8 = 0; with an end at step 1: 2 - 6 = -4 there.
@@ -54,7 +54,7 @@ def test_nothing_after_an_end_flows_back(end):
 def test_lanes_do_not_mix():
     zeros, none = torch.zeros(3, 2), torch.zeros(3, 2, dtype=torch.bool)
     values = torch.tensor([[1.0, 0.0]] * 3)
-    rollout = SimpleNamespace(rewards=zeros, values=values, done=none, truncation_values=zeros)
-    result = gae(rollout, torch.zeros(2), 0.9, 0.9)
+    rollout = SimpleNamespace(values=values, last_value=torch.zeros(2), done=none, truncation_values=zeros)
+    result = gae(zeros, rollout, 0.9, 0.9)
     assert (result[:, 0] != 0).all()
     assert (result[:, 1] == 0).all()

@@ -2,14 +2,15 @@
 
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
 from torch.distributions import Categorical
 
 import ppo_gru
-from ppo_gru import anneal, explained_variance, policy_loss, ppo_loss, value_loss
+from ppo_gru import anneal, normalize, policy_loss, policy_metrics, ppo_loss, value_loss
+from ppo_utils import moments
+from ppo_utils.logs import explained_variance, mean_logs
 
 
 def test_policy_loss_clips_every_branch_by_itself():
@@ -109,7 +110,7 @@ def test_values_are_clipped_around_the_rollout_s(played, clip_vloss):
     assert logs["value_loss"].item() == pytest.approx(1.9**2 if clip_vloss else 1.0, rel=1e-4)
 
 
-PROBES = {"ground_truth_coef": 100.0, "ground_truth_detach": True}
+PROBES = {"ground_truth_coef": 100.0, "auxiliary_detach": True}
 
 
 @pytest.mark.parametrize("max_grad_norm", [0.25, 1e9])
@@ -120,7 +121,7 @@ def test_a_gradient_step_is_no_longer_than_its_norm_allows(played, max_grad_norm
     rollout, agent = run.rollout, run.agent
     rollout.returns = rollout.values + 100
     before = {name: weight.clone() for name, weight in agent.state_dict().items()}
-    (logs,) = ppo_gru.update(agent, [torch.optim.SGD(agent.parameters(), lr=1.0)], rollout, 0.0, args)
+    (logs,), _ = ppo_gru.update(agent, [torch.optim.SGD(agent.parameters(), lr=1.0)], rollout, 0.0, args)
     steps = {name: (weight - before[name]).flatten() for name, weight in agent.state_dict().items()}
     for of_probe in (False, True):
         step = torch.cat([step for name, step in steps.items() if name.startswith("estimator") == of_probe]).norm()
@@ -137,7 +138,7 @@ def test_logs_are_means_over_minibatches():
     steps.append({"loss": 10.0, "ratio_error": 1.0})
     steps = [{name: torch.tensor(value) for name, value in step.items()} for step in steps]
     values = torch.tensor([[0.0], [1.0]])
-    found = ppo_gru.mean_logs(steps, SimpleNamespace(values=values, returns=values))
+    found = mean_logs(steps, values, values)
     assert found == {
         "losses/loss": 5.0,
         "losses/grad_norm": 4.0,
@@ -153,31 +154,60 @@ def test_one_number_that_is_not_finite_ends_the_training(name, value):
     steps = [{"loss": torch.tensor(1.0), "grad_norm": torch.tensor(1.0), "ratio_error": torch.tensor(0.0)}] * 3
     steps = [*steps, steps[0] | {name: torch.tensor(value)}]
     with pytest.raises(FloatingPointError, match="the loss or its gradient is not finite"):
-        ppo_gru.mean_logs(steps, SimpleNamespace(values=torch.zeros(2), returns=torch.zeros(2)))
+        mean_logs(steps, torch.zeros(2), torch.zeros(2))
 
 
-def test_advantages_are_normalized_by_minibatch_or_by_rollout(played, monkeypatch):
+def test_advantages_are_normalized_by_minibatch_or_by_rollout(tiny, opened, monkeypatch):
     """By rollout, its advantages have mean 0 and deviation 1, once; the returns stay."""
-    args, run, *_ = played(env_id="CueRecall-v0", norm_adv="batch")
-    rollout, seen = run.rollout, []
-    advantages = rollout.advantages = torch.randn_like(rollout.values) * 3 + 2
-    returns = rollout.returns = advantages + rollout.values
-    surrogate = ppo_gru.policy_loss
+    surrogate, update = ppo_gru.policy_loss, ppo_gru.update
+    for how in ("batch", "minibatch"):
+        seen, learned = [], []
+        monkeypatch.setattr(
+            ppo_gru, "policy_loss", lambda *given, seen=seen: (seen.append(given[1]), surrogate(*given))[1]
+        )
+        monkeypatch.setattr(
+            ppo_gru, "update", lambda *given, learned=learned: (learned.append(given[2]), update(*given))[1]
+        )
+        args = tiny(env_id="CueRecall-v0", norm_adv=how, total_timesteps=64)
+        run = opened(ppo_gru, args)
+        ppo_gru.train(args, run)
+        (rollout,) = learned
+        advantages = ppo_gru.gae(rollout.rewards, rollout, args.gamma, args.gae_lambda)
+        torch.testing.assert_close(rollout.returns, advantages + rollout.values)
+        if how == "batch":
+            wanted = (advantages - advantages.mean()) / advantages.std(correction=0)
+            torch.testing.assert_close(rollout.advantages, wanted, rtol=1e-4, atol=1e-5)
+            whole = torch.cat(seen[: args.num_minibatches]).sort().values
+            torch.testing.assert_close(whole, rollout.advantages.flatten().sort().values)
+        else:
+            assert len(seen) > 1
+            for each in seen:
+                assert each.mean().item() == pytest.approx(0.0, abs=1e-5)
+                assert each.std(correction=0).item() == pytest.approx(1.0, abs=1e-4)
 
-    def spy(log_ratio, advantages, clip_coef):
-        seen.append(advantages)
-        return surrogate(log_ratio, advantages, clip_coef)
 
-    monkeypatch.setattr(ppo_gru, "policy_loss", spy)
-    ppo_gru.update(run.agent, run.optimizers, rollout, 0.0, args)
-    torch.testing.assert_close(rollout.advantages, (advantages - advantages.mean()) / advantages.std(correction=0))
-    assert rollout.returns is returns
-    whole = torch.cat(seen[: args.num_minibatches]).sort().values
-    torch.testing.assert_close(whole, rollout.advantages.flatten().sort().values)
+def test_advantages_are_normalized_over_all_processes(monkeypatch):
+    ours, theirs = torch.randn(2, 50) * torch.tensor([[1.0], [3.0]]) + torch.tensor([[0.0], [5.0]])
+    monkeypatch.setattr(
+        moments, "all_gather", lambda mine: [mine, (50, theirs.mean().item(), theirs.var(correction=0).item())]
+    )
+    both = torch.cat([ours, theirs])
+    torch.testing.assert_close(normalize(ours), (ours - both.mean()) / both.std(correction=0))
 
-    seen.clear()
-    ppo_gru.update(run.agent, run.optimizers, rollout, 0.0, dataclasses.replace(args, norm_adv="minibatch"))
-    assert len(seen) > 1
-    for each in seen:
-        assert each.mean().item() == pytest.approx(0.0, abs=1e-5)
-        assert each.std(correction=0).item() == pytest.approx(1.0, abs=1e-4)
+
+@pytest.mark.parametrize("log_ratio", [89.0, 1000.0])
+@pytest.mark.parametrize("advantage", [0.0, 1.0, -1.0])
+def test_a_huge_ratio_gives_a_finite_loss_and_gradient(log_ratio, advantage):
+    log_ratio = torch.full((1, 1), log_ratio, requires_grad=True)
+    loss = policy_loss(log_ratio, torch.tensor([advantage]), 0.1)
+    loss.backward()
+    assert loss.isfinite()
+    assert log_ratio.grad.isfinite().all()
+    if advantage >= 0:
+        assert loss.item() == pytest.approx(-1.1 * advantage)
+
+
+def test_the_clipped_share_is_that_of_ratios():
+    """Between exp(-clip) and 1 - clip, the log-ratio is within the range and the ratio is not."""
+    for ratio, clipped in ((0.899, 1.0), (0.902, 0.0), (1.098, 0.0), (1.102, 1.0)):
+        assert policy_metrics(torch.tensor([[ratio]]).log(), 0.1)["clipfrac"] == clipped

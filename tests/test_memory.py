@@ -1,16 +1,16 @@
 """The invariants of a memory: what the update recomputes is what the rollout saw, and nothing leaks."""
 
 import contextlib
-import copy
 import math
+import weakref
 
 import numpy as np
 import pytest
 import torch
-from conftest import OTHERS, SCRIPTS, parse_args
+from conftest import OTHERS, SCRIPTS, collect, parse_args
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
+from torch.utils._pytree import tree_leaves, tree_map
 
 import ppo_gru
 import ppo_trxl
@@ -29,7 +29,7 @@ TRANSFORMER = [
     {"script": ppo_trxl, "trxl_positional_encoding": "relative", "trxl_gate": "gru", "trxl_segment_length": 5},
     {"script": ppo_trxl, "trxl_positional_encoding": "learned", "trxl_memory_length": 40, "trxl_query_position": True},
     {"script": ppo_trxl, "trxl_memory_gradient": True, "trxl_segment_length": 5},
-    {"script": ppo_trxl, "trxl_layer_norm": "post", "trxl_query_output": True, "trxl_segment_length": 5},
+    {"script": ppo_trxl, "trxl_layer_norm": "post", "trxl_segment_length": 5},
 ]
 for script in OTHERS:  # a copy of either script, with another memory
     (TRANSFORMER if hasattr(script.Args, "trxl_segment_length") else RECURRENT).append({"script": script})
@@ -50,7 +50,7 @@ def recompute(run):
     index = pieces.flat_index()
     x = run.agent.encoder({name: part.flatten(0, 1)[index] for name, part in rollout.obs.items()})
     actions = rollout.actions.flatten(0, 1)[index]
-    _, log_probs, values, _ = run.agent.evaluate_actions(x, actions, pieces, rollout.memory_state)
+    _, log_probs, values, _ = run.agent.evaluate_actions(x, actions, pieces, rollout.memory)
     return index, (log_probs - rollout.log_probs.flatten(0, 1)[index]).exp(), values
 
 
@@ -90,7 +90,7 @@ def test_ratio_is_nearly_one_in_bfloat16(played, memory):
 def test_ratio_error_sees_a_broken_memory(played, memory):
     """Guards the guard: with what the memory stored lost, the ratios are off."""
     _, run, *_ = played(iterations=3, weights_scale=3.0, env_id="CueRecall-v0", **memory)
-    for part in vars(run.rollout.memory_state).values():
+    for part in tree_leaves(vars(run.rollout.memory)):
         if isinstance(part, torch.Tensor) and part.is_floating_point():
             part.zero_()
     assert (recompute(run)[1] - 1).abs().max() > 1e-4
@@ -99,7 +99,7 @@ def test_ratio_error_sees_a_broken_memory(played, memory):
 @each_memory(MEMORIES)
 def test_bootstrap_value_is_the_next_step_s_value(played, memory):
     args, run, last_value, _ = played(iterations=2, env_id="CueRecall-v0", **memory)
-    memory.get("script", ppo_gru).collect(run.agent, run.envs, run.rollout, args)
+    collect(memory.get("script", ppo_gru), run, args)
     torch.testing.assert_close(run.rollout.values[0], last_value, atol=1e-6, rtol=0)
 
 
@@ -108,7 +108,7 @@ def test_an_episode_begins_with_an_empty_memory(played, memory):
     rollout = played(env_id="CueRecall-v0", **memory)[1].rollout
     begins = rollout.terminated[:-1]
     assert begins.any()
-    stored = rollout.memory_state.stored
+    stored = rollout.memory.stored
     assert (stored[1:][begins] == 0).all()
     assert stored[1:][~begins].flatten(1).any(1).all(), "and goes on where none ended"
     assert (stored[0] == 0).all()
@@ -163,7 +163,7 @@ def test_no_gradient_crosses_the_end_of_an_episode(played, memory):
     begins = done[:-1].flatten().nonzero()[:, 0] + pieces.num_envs  # flat indices
     assert torch.isin(begins, pieces.first).all(), "a piece begins where an episode begins"
     x = torch.randn(int(pieces.length.sum()), run.agent.encoder.width, requires_grad=True)
-    y = run.agent.memory.unroll(rollout.memory_state, x, pieces)
+    y = run.agent.memory.unroll(rollout.memory, x, pieces)
     ends = pieces.length.cumsum(0)
     piece = int((pieces.length > 2).nonzero()[1, 0])
     first, last = int(ends[piece] - pieces.length[piece]), int(ends[piece] - 1)
@@ -189,10 +189,10 @@ def test_gru_equals_a_loop_over_cells():
 @each_memory(WITH_MEMORY)
 def test_an_episode_s_first_step_is_the_same_whatever_came_before(played, memory):
     _, run, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
-    agent, state = run.agent, run.rollout.memory_state
+    agent, state = run.agent, run.rollout.memory
     obs = {"observation": torch.randn(4, 3)}
     with torch.no_grad():
-        fresh = agent.get_value(obs, agent.memory.initial_state(4, 16, torch.device("cpu")))
+        fresh = agent.get_value(obs, agent.memory.begin_rollout(agent.memory.initial(4, torch.device("cpu")), 16))
         agent.memory.reset(state, torch.tensor([True, True, True, False]))
         values = agent.get_value(obs, state)
     torch.testing.assert_close(values[:3], fresh[:3], atol=1e-6, rtol=0)  # else reset has left something
@@ -210,7 +210,7 @@ def test_the_encoder_sees_each_step_once_an_epoch_and_no_padding(played, monkeyp
     assert sum(rows) == args.update_epochs * args.num_envs * args.num_steps
     assert len(runs) == args.update_epochs * args.num_minibatches, "all pieces of a minibatch at once"
     rows.clear()
-    ppo_gru.collect(run.agent, run.envs, run.rollout, args)
+    collect(ppo_gru, run, args)
     assert rows == [args.num_envs] * (args.num_steps + 1), "no loop over lanes"
 
 
@@ -245,15 +245,15 @@ def test_a_long_episode_takes_no_more_memory_than_a_short_one(played):
 
     def storage():
         parts = {**run.rollout.obs, **{k: v for k, v in vars(run.rollout).items() if isinstance(v, torch.Tensor)}}
-        return {name: (part.data_ptr(), part.shape, part.dtype) for name, part in parts.items()}
+        return {name: (part.shape, part.dtype) for name, part in parts.items() if name not in ("advantages", "returns")}
 
     before = storage()
-    assert before["observation"][1:] == ((50, 1, 84, 84, 3), torch.uint8)
+    assert before["observation"] == ((50, 1, 84, 84, 3), torch.uint8)
     for _ in range(99):
-        ppo_gru.collect(run.agent, run.envs, run.rollout, args)
+        collect(ppo_gru, run, args)
     assert run.envs.episode_lengths[0] > 900
     assert storage() == before
-    assert run.rollout.memory_state.hidden.shape == (1, 1, 4)
+    assert run.rollout.memory.hidden.shape == (1, 1, 4)
 
 
 def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(played):
@@ -261,17 +261,17 @@ def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(pl
     changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"explosion_delay": [1000]}'}
     args, run, *_ = played(script=ppo_trxl, num_envs=1, num_steps=50, num_minibatches=1, **changes)
     # As if the episode had been going on for long; its window is still that of 50 steps.
-    run.rollout.memory_state.episode_step.add_(4050)
+    run.carry.memory["episode_step"] += 4050
 
     def storage():
-        state = run.rollout.memory_state
-        return [(part.data_ptr(), part.shape) for part in (state.keys, state.values, state.hidden, state.row_step)]
+        state = run.rollout.memory
+        return [part.shape for part in (*state.keys, *state.values, state.hidden, state.row_step)]
 
     before = storage()
     for _ in range(19):
-        ppo_trxl.collect(run.agent, run.envs, run.rollout, args)
+        collect(ppo_trxl, run, args)
         assert recompute(run)[1].sub(1).abs().max() < 1e-5
-    assert run.rollout.memory_state.episode_step > 5000
+    assert run.rollout.memory.episode_step > 5000
     assert storage() == before
 
 
@@ -283,7 +283,7 @@ def test_truncation_bootstraps_with_the_final_observation_and_the_memory_before_
     assert not rollout.terminated.any()
     assert (rollout.truncation_values != 0).equal(rollout.truncated)
     # The same actions played again: the final observation, and the memory that five steps left behind.
-    state = run.agent.memory.initial_state(4, 16, torch.device("cpu"))
+    state = run.agent.memory.begin_rollout(run.agent.memory.initial(4, torch.device("cpu")), 16)
     envs = envs_for(args, args.num_envs, seed=args.seed)
     envs.reset()
     with torch.no_grad():
@@ -307,7 +307,7 @@ def test_a_step_that_terminated_its_episode_is_not_bootstrapped(tiny, opened, mo
         return obs, rewards, truncated & [True, False], truncated, infos
 
     monkeypatch.setattr(run.envs, "step", terminate_too)
-    ppo_gru.collect(run.agent, run.envs, run.rollout, args)
+    collect(ppo_gru, run, args)
     assert run.rollout.truncated[4].all()
     assert (run.rollout.truncation_values[4] != 0).tolist() == [False, True]
 
@@ -320,11 +320,26 @@ def test_training_hands_the_rollout_to_gae(tiny, opened, monkeypatch):
     monkeypatch.setattr(ppo_gru, "gae", lambda *given: (seen.extend(given), gae(*given))[1])
     monkeypatch.setattr(ppo_gru, "update", lambda *given: (learned.update(vars(given[2])), update(*given))[1])
     ppo_gru.train(args, run)
-    rollout, _, gamma, gae_lambda = seen
-    assert rollout is run.rollout
+    rewards, rollout, gamma, gae_lambda = seen
+    assert rewards is rollout.rewards
     assert (gamma, gae_lambda) == (0.9, 0.8)
     assert learned["advantages"].equal(gae(*seen))
     assert learned["returns"].equal(gae(*seen) + rollout.values)
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_one_rollout_at_a_time_is_in_memory(tiny, script, monkeypatch):
+    alive, rollouts, collect = [], [], script.collect
+
+    def watched(*given):
+        alive.append([rollout() is not None for rollout in rollouts])
+        found = collect(*given)
+        rollouts.append(weakref.ref(found[0]))
+        return found
+
+    monkeypatch.setattr(script, "collect", watched)
+    script.main(tiny(script, env_id="CueRecall-v0", total_timesteps=192))
+    assert alive == [[], [False], [False, False]]
 
 
 @pytest.mark.parametrize("layers", [1, 2])
@@ -378,16 +393,17 @@ def test_acting_and_learning_ask_no_device_for_numbers(played, monkeypatch, memo
     on_cpu = {"episode_step", "row_step"}  # of the transformer's memory: what shapes depend on
 
     def moved(parts):
-        return {k: v.to("meta") if isinstance(v, torch.Tensor) and k not in on_cpu else v for k, v in parts.items()}
+        move = {name: part for name, part in parts.items() if name not in on_cpu}
+        return parts | tree_map(lambda part: part.to("meta") if isinstance(part, torch.Tensor) else part, move)
 
     rollout = run.rollout
-    memory = type(rollout.memory_state)(**moved(vars(rollout.memory_state)))
-    rollout = script.Rollout(**moved(vars(rollout)) | {"obs": moved(rollout.obs), "memory_state": memory})
+    memory = type(rollout.memory)(**moved(vars(rollout.memory)))
+    rollout = script.Rollout(**moved({**vars(rollout), "memory": None}) | {"memory": memory, "first_occurrence": None})
     obs = {name: part[0] for name, part in rollout.obs.items()}
     with NoQuestions(), torch.no_grad():
-        agent.memory.begin_rollout(memory, agent.memory.carry(memory))
-        agent.get_action_and_value(obs, memory)
-        agent.get_value(obs, memory)
+        state = agent.memory.begin_rollout(agent.memory.carry(memory), 16)
+        agent.get_action_and_value(obs, state)
+        agent.get_value(obs, state)
     optimizer = torch.optim.SGD(agent.parameters())
     assert fast.first_occurrences(rollout.obs) is None
     for minibatch in pieces.minibatches(2):
@@ -411,11 +427,26 @@ REFRESHED = {
 def test_refreshing_with_the_weights_that_acted_changes_nothing(played, ends, memory):
     args, run, *_ = played(iterations=3, **REFRESHED[ends], **memory)
     assert ends == "neither" or getattr(run.rollout, ends).any()
-    before = copy.deepcopy(vars(run.rollout.memory_state))
-    memory.get("script", ppo_gru).refresh_memory(run.agent, run.rollout, args)
-    for name, now in vars(run.rollout.memory_state).items():
-        same = torch.equal(before[name], now) if isinstance(now, torch.Tensor) else before[name] == now
-        assert same, f"{name}: does carry hold all that a rollout begins with?"
+    before = vars(run.rollout.memory)
+    refreshed = memory.get("script", ppo_gru).refreshed_memory(run.agent, run.rollout, args)
+    for name, now in vars(refreshed).items():
+        same = [each.equal(other) for each, other in zip(now, before[name], strict=True)] if name != "now" else [True]
+        assert all(same), f"{name}: does carry hold all that a rollout begins with?"
+    assert refreshed.now == before["now"]
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_the_next_rollout_goes_on_with_the_refreshed_memory(tiny, opened, script, monkeypatch):
+    refreshed, refreshed_memory = [], script.refreshed_memory
+    monkeypatch.setattr(
+        script, "refreshed_memory", lambda *given: refreshed.append(refreshed_memory(*given)) or refreshed[-1]
+    )
+    args = tiny(script, env_id="CueRecall-v0", refresh_memory=True, update_epochs=3, total_timesteps=64, init_lr=1e-2)
+    run = opened(script, args)
+    script.train(args, run)
+    for name, part in run.agent.memory.carry(refreshed[-1]).items():
+        assert run.carry.memory[name].equal(part)
+    assert not torch.equal(refreshed[0].hidden, refreshed[1].hidden)
 
 
 @each_memory(WITH_MEMORY)
@@ -424,16 +455,15 @@ def test_a_refreshed_memory_is_that_of_a_rollout_with_the_present_weights(played
     script = memory.get("script", ppo_gru)
     args, run, *_ = played(iterations=3, weights_scale=3.0, env_id="CueRecall-v0", **memory)
     rollout, agent = run.rollout, run.agent
-    state = copy.deepcopy(rollout.memory_state)
     with torch.no_grad():
         for parameter in agent.parameters():
             parameter.mul_(0.9)
-    script.refresh_memory(agent, rollout, args)
+    rollout.memory = script.refreshed_memory(agent, rollout, args)
     _, ratio, values = recompute(run)
     assert not torch.allclose(ratio, torch.ones(()), atol=1e-4), "the policy is another one"
     # Steps one by one, from what was stored before the rollout.
     with torch.no_grad():
-        agent.memory.begin_rollout(state, rollout.initial_memory)
+        state = agent.memory.begin_rollout(rollout.initial_memory, args.num_steps)
         wanted = []
         for t in range(args.num_steps):
             _, _, value = agent.get_action_and_value({name: part[t] for name, part in rollout.obs.items()}, state)
@@ -445,8 +475,8 @@ def test_a_refreshed_memory_is_that_of_a_rollout_with_the_present_weights(played
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_memory_is_refreshed_before_every_epoch_but_the_first(tiny, script, monkeypatch):
-    calls, refresh_memory, ppo_loss = [], script.refresh_memory, script.ppo_loss
-    monkeypatch.setattr(script, "refresh_memory", lambda *given: calls.append("r") or refresh_memory(*given))
+    calls, refreshed_memory, ppo_loss = [], script.refreshed_memory, script.ppo_loss
+    monkeypatch.setattr(script, "refreshed_memory", lambda *given: calls.append("r") or refreshed_memory(*given))
     monkeypatch.setattr(script, "ppo_loss", lambda *given: calls.append("l") or ppo_loss(*given))
     changes = {"env_id": "CueRecall-v0", "update_epochs": 3, "total_timesteps": 64}
     script.main(tiny(script, refresh_memory=True, **changes))

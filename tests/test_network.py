@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 import ppo_gru
 import ppo_trxl
@@ -69,7 +70,7 @@ def test_defaults_are_the_final_column_of_table_6_1():
     }  # fmt: skip
     assert {name: getattr(args, name) for name in final} == final
     trxl = {
-        "trxl_num_layers": 3, "trxl_dim": 384, "trxl_num_heads": 4, "trxl_memory_length": 256, "trxl_init": "xavier",
+        "trxl_num_layers": 3, "trxl_dim": 384, "trxl_num_heads": 4, "trxl_memory_length": 256,
         "trxl_positional_encoding": "absolute", "trxl_layer_norm": "pre", "trxl_gate": "none",
     }  # fmt: skip
     assert {name: getattr(ppo_trxl.Args(), name) for name in trxl} == trxl
@@ -93,7 +94,7 @@ def test_muon_has_the_matrices_between_hidden_layers(tiny, opened, script):
     changes |= {"trxl_gate": "gru", "trxl_positional_encoding": "learned"} if script is ppo_trxl else {}
     run = opened(script, tiny(script, optimizer="muon", **changes))
     adamw, muon = run.optimizers
-    assert (type(adamw), type(muon)) == (torch.optim.AdamW, torch.optim.Muon)
+    assert (type(adamw), type(muon)) == (torch.optim.AdamW, fast.Muon)
     names = {weight: name for name, weight in run.agent.named_parameters()}
     (theirs,), (group,) = adamw.param_groups, muon.param_groups
     assert len(theirs["params"]) + len(group["params"]) == len(names)
@@ -102,22 +103,53 @@ def test_muon_has_the_matrices_between_hidden_layers(tiny, opened, script):
     blocks = [f"memory.blocks.{k}." for k in range(2)] if script is ppo_trxl else []
     inside = [f"attention.{each}" for each in ("query", "key", "value", "output")] + ["projection"]
     gates = ("merge_attention", "merge_projection")
-    inside += [f"{gate}.{each}" for gate in gates for each in ("from_y", "from_x", "candidate")]
+    gate_layers = [f"{layer}_{of}" for layer in ("reset", "update", "candidate") for of in "xy"]
+    inside += [f"{gate}.{each}" for gate in gates for each in gate_layers]
     assert {names[weight] for weight in group["params"]} == common | {f"{b}{i}.weight" for b in blocks for i in inside}
     assert (group["weight_decay"], group["momentum"], group["adjust_lr_fn"]) == (0.01, 0.95, "match_rms_adamw")
     assert (group["nesterov"], group["ns_steps"]) == (True, 5)
     assert (theirs["weight_decay"], theirs["betas"], theirs["eps"]) == (0.01, (0.9, 0.999), 1e-8)
 
 
-def test_muon_s_learning_rate(tiny, monkeypatch):
-    """In multiples of AdamW's, all along its decay."""
-    seen, step = [], torch.optim.Muon.step
-    monkeypatch.setattr(torch.optim.Muon, "step", lambda muon: (seen.append(muon.param_groups[0]["lr"]), step(muon)))
-    args = tiny(
-        env_id="CueRecall-v0", optimizer="muon", muon_lr_ratio=5.0, init_lr=0.01, final_lr=0.0, anneal_steps=128
-    )
-    ppo_gru.main(args)
-    assert seen == [0.05] * 4 + [0.025] * 4
+def test_learning_rates(tiny, monkeypatch):
+    """Muon's is three times AdamW's, all along its decay."""
+    seen = {torch.optim.AdamW: [], fast.Muon: []}
+    for kind in seen:
+        rates, step = seen[kind], kind.step
+        keep = lambda self, rates=rates, step=step: (rates.append(self.param_groups[0]["lr"]), step(self))  # noqa: E731
+        monkeypatch.setattr(kind, "step", keep)
+    ppo_gru.main(tiny(env_id="CueRecall-v0", optimizer="muon", init_lr=0.01, final_lr=0.0, anneal_steps=128))
+    assert seen[torch.optim.AdamW] == [0.01] * 4 + [0.005] * 4
+    assert seen[fast.Muon] == pytest.approx([0.03] * 4 + [0.015] * 4)
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (24, 8), (8, 24)])
+def test_muon_steps_as_the_library_s(shape):
+    """Up to what bfloat16 rounds in the library; a shape's matrices at once, those without gradient left alone."""
+    torch.manual_seed(0)
+    ours, theirs = ([nn.Parameter(torch.zeros(shape)) for _ in range(3)] for _ in range(2))
+    how = {"lr": 0.02, "weight_decay": 0.01, "adjust_lr_fn": "match_rms_adamw"}
+    optimizers = fast.Muon(ours, **how), torch.optim.Muon(theirs, **how)
+    for _ in range(4):
+        before = ours[0].detach().clone()
+        for mine, other in zip(ours[:2], theirs[:2], strict=True):
+            mine.grad = torch.randn(shape)
+            other.grad = mine.grad.clone()
+        for optimizer in optimizers:
+            optimizer.step()
+        assert (ours[0] - before).square().mean().sqrt().item() == pytest.approx(0.2 * 0.02, rel=0.3)
+    for mine, other in zip(ours[:2], theirs[:2], strict=True):
+        assert (mine - other).norm() < 0.03 * other.norm()
+    assert ours[2].eq(0).all()
+
+
+def test_orthogonal_matrices():
+    """Singular values near 1, whatever they were; each matrix by itself."""
+    torch.manual_seed(0)
+    scales = torch.tensor([1e-3, 1.0, 1e3])[:, None, None]
+    found = fast.orthogonalize(torch.randn(3, 12, 5) * scales, (3.4445, -4.7750, 2.0315), 5)
+    values = torch.linalg.svdvals(found)
+    assert ((values > 0.6) & (values < 1.3)).all()
 
 
 @pytest.mark.parametrize("memory", ["gru", "lstm"])
@@ -156,11 +188,9 @@ def test_the_gate_by_its_equations():
     torch.manual_seed(0)
     gate = ppo_trxl.Gate(6, 2.0).double()
     x, y = torch.randn(2, 4, 3, 6, dtype=torch.float64)
-    w_r, w_z, w_h = (matrix.T for matrix in gate.from_y.weight.split(6))
-    u_r, u_z = (matrix.T for matrix in gate.from_x.weight.split(6))
-    r = 1 / (1 + torch.exp(-(y @ w_r + x @ u_r)))
-    z = 1 / (1 + torch.exp(-(y @ w_z + x @ u_z - 2.0)))
-    h = torch.tanh(y @ w_h + (r * x) @ gate.candidate.weight.T)
+    r = 1 / (1 + torch.exp(-(y @ gate.reset_y.weight.T + x @ gate.reset_x.weight.T)))
+    z = 1 / (1 + torch.exp(-(y @ gate.update_y.weight.T + x @ gate.update_x.weight.T - 2.0)))
+    h = torch.tanh(y @ gate.candidate_y.weight.T + (r * x) @ gate.candidate_x.weight.T)
     torch.testing.assert_close(gate(x, y), (1 - z) * x + z * h, atol=1e-12, rtol=0)
 
 
@@ -201,22 +231,6 @@ def test_heads_compute_in_float32_with_amp():
     found, wanted = ([policy[0].logits, *others] for policy, *others in (found, wanted))
     for got, want in zip(found, wanted, strict=True):
         torch.testing.assert_close(got, want, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("scheme", ["xavier", "orthogonal", "kaiming", "tfixup"])
-def test_every_matrix_of_a_gate_is_initialized_alike(scheme):
-    """As if each had a layer of its own."""
-    torch.manual_seed(0)
-    block = ppo_trxl.Block(ppo_trxl.Args(trxl_dim=128, trxl_gate="gru"))
-    ppo_trxl.block_init(block, scheme, 3)
-    want = block.attention.query.weight.std().item()
-    for gate in (block.merge_attention, block.merge_projection):
-        matrices = torch.cat([gate.from_y.weight, gate.from_x.weight, gate.candidate.weight]).split(128)
-        assert len(matrices) == 6
-        assert [matrix.std().item() for matrix in matrices] == pytest.approx([want] * 6, rel=0.05)
-        if scheme == "orthogonal":
-            for matrix in matrices:
-                torch.testing.assert_close(matrix @ matrix.T, torch.eye(128), atol=1e-5, rtol=0)
 
 
 def test_bytes_are_scaled_to_one():

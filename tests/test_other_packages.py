@@ -559,12 +559,12 @@ def test_a_module_in_the_current_folder(tmp_path, monkeypatch):
 @EACH_SCRIPT
 def test_a_loop_past_its_room(script, tiny, opened):
     run = opened(script, tiny(script, env_id="CartPole-v1"))
-    memory, obs = run.agent.memory.initial_state(4, 2, torch.device("cpu")), run.rollout.next_obs
+    memory, obs = run.agent.memory.begin_rollout(run.carry.memory, 2), run.carry.obs
     act = lambda: run.agent.get_action_and_value(environments.as_tensors(obs, torch.device("cpu")), memory)  # noqa: E731
     act(), act()
-    with pytest.raises(IndexError, match=r"no room for this step; begin_rollout\(state, carry\(state\)\) makes room"):
+    with pytest.raises(IndexError, match=r"no room for this step; begin_rollout\(carry\(state\), num_steps\)"):
         act()
-    run.agent.memory.begin_rollout(memory, run.agent.memory.carry(memory))
+    memory = run.agent.memory.begin_rollout(run.agent.memory.carry(memory), 2)
     act()
 
 

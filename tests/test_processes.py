@@ -1,7 +1,6 @@
 """Several processes that torchrun starts train one agent; here two, on the CPU."""
 
 import copy
-import dataclasses
 import itertools
 import os
 import random
@@ -16,20 +15,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import parse_args
+from conftest import collect, parse_args
 
 import ppo_gru
 import ppo_trxl
 from ppo_utils import environments, processes, runs
 from ppo_utils.checkpoints import read_checkpoint, read_model
-from ppo_utils.logs import combine_logs
+from ppo_utils.logs import combine_logs, mean_logs
 
 SCRIPTS = [ppo_gru, ppo_trxl]
 GRID = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector"}
 WIDTH = {ppo_gru: "--hidden-size 16", ppo_trxl: "--trxl-dim 16 --trxl-memory-length 7"}
 ONE_UPDATE = """
 import importlib
+from dataclasses import replace
 import torch
+from ppo_utils.logs import mean_logs
 from ppo_utils.processes import rank_and_size
 from ppo_utils.runs import close
 updated = []
@@ -39,15 +40,15 @@ for name, args, weights, rollout in torch.load("given.pt", weights_only=False):
     rank, processes = rank_and_size()
     run.agent.load_state_dict(weights)
     lanes = torch.arange(args.num_envs).chunk(processes)[rank]
-    for name, stored in rollout.items():
-        # Two processes, 16 lanes each: lanes are the second axis of a rollout.
-        if isinstance(stored, torch.Tensor):
-            setattr(run.rollout, name, stored[:, lanes])
-    run.rollout.obs = {name: part[:, lanes] for name, part in rollout["obs"].items()}
-    for name in ("stored",) if script.__name__ == "ppo_gru" else ("hidden", "row_step"):
-        setattr(run.rollout.memory_state, name, getattr(rollout["memory_state"], name)[:, lanes])
+    # Two processes, 16 lanes each: lanes are the second axis of a rollout.
+    share = {name: part[:, lanes] for name, part in rollout.items() if isinstance(part, torch.Tensor)}
+    share["obs"] = {name: part[:, lanes] for name, part in rollout["obs"].items()}
+    stored = ("stored",) if script.__name__ == "ppo_gru" else ("hidden", "row_step")
+    memory = replace(rollout["memory"], **{name: getattr(rollout["memory"], name)[:, lanes] for name in stored})
+    rollout = script.Rollout(**rollout | share | {"memory": memory})
     optimizer = torch.optim.SGD(run.agent.parameters(), lr=1.0)
-    logs = script.mean_logs(script.update(run.agent, [optimizer], run.rollout, 0.01, args), run.rollout)
+    step_logs, _ = script.update(run.agent, [optimizer], rollout, 0.01, args)
+    logs = mean_logs(step_logs, rollout.values, rollout.returns)
     updated.append((run.agent.state_dict(), logs))
 torch.save(updated, f"updated{rank}.pt")
 close(run)
@@ -67,10 +68,10 @@ def flags_of(script, **changes):
 def rollout_to_learn_from(script, args, run):
     """Play two rollouts, with random advantages and returns; return all that another process needs of it."""
     for _ in range(2):
-        script.collect(run.agent, run.envs, run.rollout, args)
+        collect(script, run, args)
     run.rollout.advantages = torch.randn(run.rollout.values.shape)
     run.rollout.returns = run.rollout.values + torch.randn(run.rollout.values.shape)
-    given = {field.name: getattr(run.rollout, field.name) for field in dataclasses.fields(run.rollout)}
+    given = {**vars(run.rollout), "last_value": None, "first_occurrence": None}
     weights = {name: weight.clone() for name, weight in run.agent.state_dict().items()}
     return script.__name__, args, weights, copy.deepcopy(given)
 
@@ -87,7 +88,8 @@ def test_two_processes_make_the_update_of_one(tiny, opened):
         run = opened(script, args)
         given.append(rollout_to_learn_from(script, args, run))
         optimizer = torch.optim.SGD(run.agent.parameters(), lr=1.0)
-        logs = script.mean_logs(script.update(run.agent, [optimizer], run.rollout, 0.01, args), run.rollout)
+        step_logs, _ = script.update(run.agent, [optimizer], run.rollout, 0.01, args)
+        logs = mean_logs(step_logs, run.rollout.values, run.rollout.returns)
         alone.append((run.agent.state_dict(), logs))
     torch.save(given, "given.pt")
 
@@ -167,10 +169,10 @@ def test_target_kl_is_compared_with_the_mean_of_all_processes(tiny, opened, monk
     """Here two; what this one has is far below the target."""
     args = tiny(**GRID, target_kl=0.4, init_lr=1e-6, total_timesteps=64)
     run = opened(ppo_gru, args)
-    ppo_gru.collect(run.agent, run.envs, run.rollout, args)
+    collect(ppo_gru, run, args)
     run.rollout.advantages, run.rollout.returns = torch.zeros(2, *run.rollout.values.shape)
     monkeypatch.setattr(ppo_gru, "all_gather", lambda kl: [kl, others])
-    logs = ppo_gru.update(run.agent, run.optimizers, run.rollout, 0.0, args)
+    logs, _ = ppo_gru.update(run.agent, run.optimizers, run.rollout, 0.0, args)
     assert sum("grad_norm" in each for each in logs) == steps
 
 

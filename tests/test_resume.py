@@ -41,7 +41,7 @@ RUNS = {
     },
     "no memory, stack": {**GRID, "memory": "none", "frame_stack": 3, "step_encoding": True, "norm_adv": "batch"},
     "GRU, ground truth": {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "ground_truth_coef": 0.1},
-    "GRU, probe": {**GRID, "ground_truth_coef": 0.1, "ground_truth_detach": True, "observe_last_action": True},
+    "GRU, probe": {**GRID, "ground_truth_coef": 0.1, "auxiliary_detach": True, "observe_last_action": True},
     "GRU, evaluations": {**GRID, "eval_interval": 2, "eval_levels": 2},
     "GRU, truncated": {
         "env_id": "SearingSpotlights-v0", "env_options": '{"max_steps": 9}', "bootstrap_truncated": True
@@ -57,7 +57,7 @@ RUNS = {
         "trxl_memory_gradient": True, "refresh_memory": True,
     },
     "TrXL, output in the query": {
-        "script": ppo_trxl, **ENDLESS, "trxl_query_output": True, "trxl_layer_norm": "post"
+        "script": ppo_trxl, **ENDLESS, "trxl_layer_norm": "post"
     },
     "GRU, no embedding": {**GRID, "embedding": False},
     "TrXL, no encoding": {"script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "none"},
@@ -69,7 +69,7 @@ RUNS = {
     "GTrXL, Muon": {"script": ppo_trxl, **ENDLESS, "trxl_gate": "gru", "optimizer": "muon"},
     "TrXL, both heads": {
         "script": ppo_trxl, "env_id": "SearingSpotlights-v0", "ground_truth_coef": 0.1, "reconstruction_coef": 0.1,
-        "reconstruction_detach": True,
+        "auxiliary_detach": True,
     },
 }  # fmt: skip
 
@@ -215,11 +215,11 @@ def test_environments_of_other_packages_begin_new_episodes(tiny, opened, curves,
     run = opened(ppo_gru, parse_args(ppo_gru, "--resume", str(folder)))
     assert "CartPole-v1 has no state to save: every environment begins a new episode" in capfd.readouterr().err
     first = opened(ppo_gru, tiny(env_id="CartPole-v1", exp_name="first"))
-    for name, part in run.rollout.next_obs.items():
-        assert not (part == first.rollout.next_obs[name]).all(axis=1).any(), "not the episodes that it began with"
-    assert not run.rollout.memory_state.hidden.any()
-    scale = run.rollout.return_scale
-    assert (scale.count, scale.discounted.any()) == (128, False), "no reward of an earlier episode counts"
+    for name, part in run.carry.obs.items():
+        assert not (part == first.carry.obs[name]).all(axis=1).any(), "not the episodes that it began with"
+    assert not run.carry.memory["hidden"].any()
+    scale = run.return_scale
+    assert (scale.count, scale.discounted) == (128, None), "no reward of an earlier episode counts"
     runs.run_to_end(args, run, ppo_gru.train)
     assert [step for step, _ in curves(folder)["losses/loss"]] == [64, 128, 192, 256, 320]
 
@@ -405,16 +405,17 @@ def test_a_folder_that_cannot_be_written(trained, monkeypatch):
         resumed(ppo_gru, trained)
 
 
-@pytest.mark.parametrize("missing", ["memory", "hidden states", "return_scale", "optimizers", "optimizer"])
+@pytest.mark.parametrize("missing", ["carry", "rates", "hidden states", "return_scale", "optimizers", "optimizer"])
 def test_a_checkpoint_of_another_version(tiny, missing):
     folder = ppo_trxl.main(tiny(ppo_trxl, **GRID, capture_video=False))
     path = folder / "checkpoint-128.pt"
     saved = read_model(path)
-    if missing == "memory":  # a transformer's was before: the whole rollout, by other names
-        memory = saved["processes"][0]["memory"]
-        saved["processes"][0]["memory"] = {"items": memory["hidden"], "episode_step": memory["episode_step"]}
+    if missing == "carry":  # before, its parts were beside the environments
+        saved["processes"][0] |= saved["processes"][0].pop("carry")
+    elif missing == "rates":  # before, an optimizer did not say in what relation to others
+        del saved["optimizers"][0]["param_groups"][0]["lr_ratio"]
     elif missing == "hidden states":  # before, the last block's output was stored always
-        memory = saved["processes"][0]["memory"]
+        memory = saved["processes"][0]["carry"]["memory"]
         memory["hidden"] = torch.cat([memory["hidden"], memory["hidden"][:, :, -1:]], 2)
     elif missing == "return_scale":
         del saved["processes"][0]["return_scale"]

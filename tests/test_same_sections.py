@@ -5,6 +5,7 @@ from pathlib import Path
 
 import ppo_gru
 import ppo_trxl
+from ppo_utils.flags import RunArgs
 
 BANNER = re.compile(r"^# ---- (\d .+) ----$", re.MULTILINE)
 SHARED = ("2 TRAINING", "3 PPO", "5 AGENT", "6 MAIN")
@@ -25,7 +26,7 @@ def test_shared_sections_are_the_same_to_the_byte():
 
 def test_what_is_shared_of_the_other_sections():
     gru, trxl = sections(ppo_gru)["1 ARGS"], sections(ppo_trxl)["1 ARGS"]
-    begin = "    exp_name: str"
+    begin = "    total_timesteps: PositiveInt"
     shared = gru[gru.index(begin) : gru.index("    memory: Literal")]
     assert shared == trxl[trxl.index(begin) : trxl.index("    trxl_num_layers:")]
     interface = [sections(script)["4 MEMORY"].partition("\n@dataclass")[0] for script in (ppo_gru, ppo_trxl)]
@@ -38,5 +39,11 @@ def test_flags_differ_in_the_memory_alone():
     assert gru == [*shared, "memory", "hidden_size", "num_layers", "seq_len"]
     assert [name for name in trxl if not name.startswith("trxl_")] == shared
     defaults = [{name: getattr(script.Args(), name) for name in shared} for script in (ppo_gru, ppo_trxl)]
-    assert defaults[0] == {**defaults[1], "exp_name": "ppo_gru"}
-    assert defaults[1]["exp_name"] == "ppo_trxl"
+    assert defaults[0] == defaults[1]
+
+
+def test_flags_of_the_run_are_read_by_no_line_of_a_script():
+    """And those that a script reads stand in it."""
+    for script in (ppo_gru, ppo_trxl):
+        text = Path(script.__file__).read_text()
+        assert not [name for name in RunArgs.__dataclass_fields__ if f"args.{name}" in text]

@@ -116,6 +116,6 @@ def test_padded_length_is_the_longest_piece(seq_len, monkeypatch):
     done = torch.zeros(32, 3, dtype=torch.bool)
     done[[4, 20]] = True
     pieces = memory.cut(done)
-    y = memory.unroll(memory.initial_state(3, 32, torch.device("cpu")), torch.randn(96, 4), pieces)
+    y = memory.unroll(memory.begin_rollout(memory.initial(3, torch.device("cpu")), 32), torch.randn(96, 4), pieces)
     assert seen == [(len(pieces.length), seq_len or 16, 4)], "the recurrent layers run once, padded no further"
     assert y.shape == (96, 4)

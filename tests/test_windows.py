@@ -9,8 +9,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from enjoy import attention_of, attention_weights
-from ppo_trxl import Args, Attention, Memory, attention_mask, sinusoid
+from enjoy import attention_weights
+from ppo_trxl import Args, Attention, Memory, attended_keys, attention_mask, sinusoid
 
 ENCODINGS = ["absolute", "learned", "relative", "none"]
 STEPS, LANES, WIDTH = 24, 3, 8
@@ -19,8 +19,6 @@ STEPS, LANES, WIDTH = 24, 3, 8
 def make_memory(**changes):
     """A small memory in float64 whose parameters are all random: zeros would hide a missing term."""
     small = {"trxl_dim": WIDTH, "trxl_num_heads": 2, "trxl_num_layers": 2, "trxl_memory_length": 5, "num_steps": STEPS}
-    if changes.get("trxl_positional_encoding") == "learned":
-        small["trxl_pe_length"] = 64
     torch.manual_seed(0)
     memory = Memory(Args(**{**small, "trxl_segment_length": 8, **changes}), WIDTH).double()
     for parameter in memory.parameters():
@@ -30,8 +28,8 @@ def make_memory(**changes):
 
 def fresh(memory, num_envs=LANES, num_steps=STEPS):
     """The memory of fresh episodes in float64."""
-    state = memory.initial_state(num_envs, num_steps, torch.device("cpu"))
-    return replace(state, **{name: getattr(state, name).double() for name in ("hidden", "keys", "values")})
+    carry = memory.initial(num_envs, torch.device("cpu"))
+    return memory.begin_rollout(carry | {"hidden": carry["hidden"].double()}, num_steps)
 
 
 def take_step(memory, state, x):
@@ -43,14 +41,14 @@ def take_step(memory, state, x):
 
 def begin_rollout(memory, state):
     """Begin the next rollout."""
-    memory.begin_rollout(state, memory.carry(state))
+    return memory.begin_rollout(memory.carry(state), STEPS)
 
 
 def make_timeline(memory, seed=1):
     """Random hidden states, and steps of episodes that end at random; in environment 0 one ends before the rollout."""
     generator = torch.Generator().manual_seed(seed)
     rows = memory.window + STEPS
-    hidden = torch.randn(rows, LANES, memory.stored, WIDTH, dtype=torch.float64, generator=generator)
+    hidden = torch.randn(rows, LANES, len(memory.blocks), WIDTH, dtype=torch.float64, generator=generator)
     ends = torch.rand(rows, LANES, generator=generator) < 0.15
     ends[memory.window, 0] = True
     steps = torch.zeros(rows, LANES, dtype=torch.int64)
@@ -79,10 +77,9 @@ def merged(merge, x, y):
     """The sum of x and y, or what a gate makes of them (Parisotto et al., 2020)."""
     if merge is torch.add:
         return x + y
-    w_r, w_z, w_h = merge.from_y.weight.split(WIDTH)
-    u_r, u_z = merge.from_x.weight.split(WIDTH)
-    r, z = torch.sigmoid(w_r @ y + u_r @ x), torch.sigmoid(w_z @ y + u_z @ x - merge.bias)
-    return (1 - z) * x + z * torch.tanh(w_h @ y + merge.candidate.weight @ (r * x))
+    r = torch.sigmoid(merge.reset_y.weight @ y + merge.reset_x.weight @ x)
+    z = torch.sigmoid(merge.update_y.weight @ y + merge.update_x.weight @ x - merge.bias)
+    return (1 - z) * x + z * torch.tanh(merge.candidate_y.weight @ y + merge.candidate_x.weight @ (r * x))
 
 
 def naive(memory, x, row, lane, stored, own=None):
@@ -95,10 +92,8 @@ def naive(memory, x, row, lane, stored, own=None):
     window = min(step, memory.window)
     at = torch.arange(row - window, row)
     added = torch.zeros_like(x)
-    if memory.query_position:
+    if memory.blocks[0].query_position:
         added = added + encoded(memory, step)
-    if memory.query_output is not None and step > 0:
-        added = added + memory.query_output.weight @ stored.hidden[row - 1, lane, -1]
     inputs = []
     for k, block in enumerate(memory.blocks):
         attention = block.attention
@@ -141,8 +136,7 @@ VARIANTS = [
     for encoding in ENCODINGS
     for changes in (
         {"trxl_query_position": True},
-        {"trxl_query_output": True},
-        {"trxl_query_position": True, "trxl_query_output": True, "trxl_layer_norm": "post"},
+        {"trxl_query_position": True, "trxl_layer_norm": "post"},
         {"trxl_gate": "gru", "trxl_layer_norm": "post"},
     )
 ]
@@ -234,7 +228,7 @@ def test_playing_equals_unrolling(encoding, window):
         done[:, 0] = False
         played = []
         with torch.no_grad():
-            begin_rollout(memory, state)
+            state = begin_rollout(memory, state)
             for t in range(STEPS):
                 played.append(take_step(memory, state, x[t]))
                 memory.reset(state, done[t])
@@ -299,28 +293,26 @@ def test_attention_equals_the_library_s():
     torch.testing.assert_close(attention_weights(attention, x, attention.key(items), age, seen), weights)
 
 
-def test_attention_of_a_step():
-    memory = make_memory(trxl_positional_encoding="relative")
-    state = fresh(memory)
-    for t in range(9):
-        x = torch.randn(LANES, WIDTH, dtype=torch.float64)
-        weights = attention_of(memory, state, x)
-        assert weights.shape == (LANES, 2, 2, min(max(t, 1), 5))
-        torch.testing.assert_close(weights.sum(-1), torch.full((LANES, 2, 2), float(t > 0), dtype=torch.float64))
-        with torch.no_grad():
-            take_step(memory, state, x)
-
-
 def test_the_drawn_example():
-    """What the docstring of Memory.unroll draws."""
-    age = torch.arange(4)[:, None] - torch.tensor([-3, -2, -1, 0, 1, 2])
-    seen = attention_mask(age, torch.tensor([5, 6, 0, 1])[:, None], 3).int().tolist()
-    assert seen == [[1, 1, 1, 0, 0, 0], [0, 1, 1, 1, 0, 0], [0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1]]
+    """What the docstring of `attended_keys` draws."""
+    keys, age, mask = attended_keys(torch.tensor([[5, 6, 0, 1]]), 3, torch.device("cpu"))
+    assert keys.tolist() == [-3, -2, -1, 0, 1, 2]
+    assert age[:, 3].tolist() == [0, 1, 2, 3]
+    assert mask[0].int().tolist() == [[1, 1, 1, 0, 0, 0], [0, 1, 1, 1, 0, 0], [0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1]]
+
+
+@pytest.mark.parametrize(("steps", "before"), [([0, 0], 1), ([0, 2], 2), ([9, 1], 5)])
+def test_the_window_while_acting(steps, before):
+    """Queries of one step: keys as far back as the longest episode reaches, at most the window, and at least one."""
+    keys, age, mask = attended_keys(torch.tensor(steps)[:, None], 5, torch.device("cpu"))
+    assert keys.tolist() == [*range(-before, 0)]
+    assert age.tolist() == [[*range(before, 0, -1)]]
+    assert mask.sum(-1)[:, 0].tolist() == [min(step, 5) for step in steps]
 
 
 @pytest.mark.parametrize("fill", [1e6, math.nan])
 @pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize("flag", ["trxl_memory_gradient", "trxl_query_output", "trxl_query_position"])
+@pytest.mark.parametrize("flag", ["trxl_memory_gradient", "trxl_query_position"])
 def test_what_is_not_seen_changes_nothing(encoding, fill, flag):
     memory = make_memory(trxl_positional_encoding=encoding, **{flag: True})
     stored = make_timeline(memory)
@@ -355,10 +347,8 @@ def test_a_forgotten_episode_leaves_nothing_in_the_cache():
             assert take_step(memory, state, x).isfinite().all()
 
 
-@pytest.mark.parametrize("query_output", [False, True])
-def test_a_step_stores_the_inputs_of_its_blocks(query_output):
-    """And what the last one returns, for --trxl-query-output only."""
-    memory, inputs = make_memory(trxl_query_output=query_output), []
+def test_a_step_stores_the_inputs_of_its_blocks():
+    memory, inputs = make_memory(), []
     for block in memory.blocks:
         block.register_forward_pre_hook(lambda _, given: inputs.append(given[0]))
     state, x = fresh(memory), torch.randn(LANES, WIDTH).double()
@@ -366,8 +356,7 @@ def test_a_step_stores_the_inputs_of_its_blocks(query_output):
         inputs.clear()
         with torch.no_grad():
             y, hidden = memory.step(state, x)
-        wanted = [*inputs, y[:, None]] if query_output else inputs
-        assert hidden.equal(torch.cat(wanted, 1))
+        assert hidden.equal(torch.cat(inputs, 1))
         memory.advance(state, hidden)
         assert state.hidden[state.now - 1].equal(hidden)
         x = y
@@ -384,21 +373,24 @@ def test_a_step_that_is_not_stored_changes_nothing():
             assert take_step(memory, state, x).equal(take_step(memory, again, x))
         memory.step(again, other)
         for name, part in vars(state).items():
-            assert part == again.now if name == "now" else part.equal(getattr(again, name)), name
-        begin_rollout(memory, state)
-        begin_rollout(memory, again)
+            other = getattr(again, name)
+            assert part == other if name == "now" else all(map(torch.equal, part, other)), name
+        state, again = begin_rollout(memory, state), begin_rollout(memory, again)
         assert memory.step(state, x)[0].equal(memory.step(again, x)[0])
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_episodes_longer_than_a_learned_encoding(encoding):
     """Steps beyond the table of six have the encoding of step 6, what follows an episode of six steps."""
-    length = {"trxl_pe_length": 6} if encoding == "learned" else {}
-    memory = make_memory(trxl_positional_encoding=encoding, **length)
-    at = memory.position(torch.tensor([4, 5, 6, 7, 5000]), torch.float64)
+    memory = make_memory(trxl_positional_encoding=encoding)
+    if encoding == "learned":
+        memory.table = torch.nn.Parameter(memory.table[:7].detach())
+    at = memory.position(torch.tensor([4, 5, 6, 7, 5000]), torch.zeros((), dtype=torch.float64))
     assert np.shape(at) == ((5, WIDTH) if encoding in ("absolute", "learned") else ())
     if encoding == "learned":
         assert at.equal(memory.table[[4, 5, 6, 6, 6]])
+    elif encoding == "absolute":
+        assert at.equal(sinusoid(torch.tensor([4, 5, 6, 7, 5000]), WIDTH)), "the table of sinusoids grows"
     state = fresh(memory, 1)
     with torch.no_grad():
         for _ in range(9):
@@ -414,14 +406,15 @@ def test_sinusoid():
     )
 
 
-@pytest.mark.parametrize("scheme", ["xavier", "orthogonal", "kaiming", "tfixup"])
-def test_initialization(scheme):
+@pytest.mark.parametrize("gate", ["none", "gru"])
+def test_initialization(gate):
+    """Xavier's uniform distribution for every matrix, those of gates too; biases are 0 (table 6.1)."""
     torch.manual_seed(0)
-    block = Memory(Args(trxl_init=scheme, trxl_num_layers=4), 384).blocks[0]
-    deviation = {"xavier": 384**-0.5, "orthogonal": 384**-0.5, "kaiming": (2 / 384) ** 0.5, "tfixup": 384**-0.5}[scheme]
-    scale = 0.67 * 4**-0.25 if scheme == "tfixup" else 1.0
-    assert block.attention.query.weight.std().item() == pytest.approx(deviation, rel=0.02)
-    assert block.projection.weight.std().item() == pytest.approx(deviation * scale, rel=0.02)
-    assert block.projection.bias.eq(0).all()
-    weight = block.attention.query.weight
-    assert torch.allclose(weight @ weight.T, torch.eye(384), atol=1e-4) == (scheme == "orthogonal")
+    block = Memory(Args(trxl_num_layers=2, trxl_gate=gate, trxl_gate_bias=0.0), 384).blocks[1]
+    layers = [layer for layer in block.modules() if isinstance(layer, torch.nn.Linear)]
+    assert len(layers) == (5 if gate == "none" else 17)
+    for layer in layers:
+        assert layer.weight.std().item() == pytest.approx(384**-0.5, rel=0.02)
+        kurtosis = (layer.weight / layer.weight.std()).pow(4).mean().item()
+        assert kurtosis == pytest.approx(1.8, rel=0.05), "a normal distribution has 3"
+        assert layer.bias is None or layer.bias.eq(0).all()
