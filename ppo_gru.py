@@ -15,7 +15,7 @@ called the thesis below: §5.2 is a section of it, (5.7) an equation. Defaults a
 without auxiliary losses.
 
 How to read: section 2 is the training loop and what it calls, from the top down; 3 to 5 are what these are built from,
-4 the memory; 6 makes everything. Code that does not depend on the algorithm comes from ppo_utils/: types of flags,
+4 the memory; 6 makes everything. Code that does not depend on the algorithm comes from ppo_utils/: flags of the run,
 environments, evaluation, run folder, checkpoints, several processes, and faster ways to compute the same.
 
 Shape letters: T steps of a rollout, N environments, A action branches, B steps of a minibatch, S sequences in it, L
@@ -30,6 +30,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -131,14 +132,10 @@ class Args(RunArgs):
 
 LAPTOP = {
     "preset": "laptop",
-    # what is observed and the width of the network
     "obs_type": "vector", "hidden_size": 128, "trunk_size": 128,
-    # rollouts and minibatches
     "num_envs": 128, "num_steps": 128, "num_minibatches": 16, "update_epochs": 2,
-    # PPO
     "norm_reward": True, "gamma": 0.99, "clip_coef": 0.2, "target_kl": 0.05, "max_grad_norm": 0.5,
     "exploration_bonus": "log-barrier", "init_ent_coef": 2e-3, "final_ent_coef": 2e-4,
-    # the schedule
     "optimizer": "muon", "init_lr": 1e-3, "final_lr": 1e-4, "total_timesteps": 6_000_000, "anneal_steps": None,
 }  # fmt: skip
 QUICKSTART = {
@@ -185,10 +182,9 @@ def train(args: Args, run: Run) -> None:
         logs = mean_logs(step_logs, rollout.values, rollout.returns)
         del rollout, memory  # before the next one is collected: one at a time is in memory
         logs |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
-        logs |= {"charts/seconds_collect": collected - began, "charts/seconds_update": updated - collected}
-        logs |= {"charts/seconds_iteration": updated - began}
         run.step = global_step + batch_size
-        end_iteration(args, run, logs, episodes)  # evaluation, TensorBoard, progress bar, checkpoint
+        times = began, collected, updated
+        end_iteration(args, run, logs, episodes, times)  # evaluation, TensorBoard, progress bar, checkpoint
         if run.stop:
             break
 
@@ -233,10 +229,7 @@ class Rollout:
         device = next(agent.parameters()).device
         obs = as_tensors(carry.obs, device)
         num_envs, branches = len(next(iter(obs.values()))), len(agent.heads.nvec)
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(num_steps, num_envs, *shape, dtype=dtype, device=device)
-
+        zeros = partial(torch.zeros, num_steps, num_envs, device=device)
         return cls(
             obs={name: zeros(*part.shape[1:], dtype=part.dtype) for name, part in obs.items()},
             ground_truth=None if carry.ground_truth is None else zeros(carry.ground_truth.shape[1]),

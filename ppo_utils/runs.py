@@ -226,12 +226,21 @@ def report_failed_write(folder: Path) -> Iterator[None]:
         raise RunError(f"cannot write to {error.filename or folder} ({error.strerror})") from error
 
 
-def end_iteration(args: RunArgs, run: Run, logs: dict[str, float], episodes: dict[str, list[float]]) -> None:
+def end_iteration(
+    args: RunArgs,
+    run: Run,
+    logs: dict[str, float],
+    episodes: dict[str, list[float]],
+    times: tuple[float, float, float],
+) -> None:
     """End an iteration: evaluate, log, and save, each where it is due.
 
-    logs need charts/seconds_iteration, the time that the iteration took. Raises RunError if a file cannot be written or
-    a process is gone, FloatingPointError if a weight is not finite.
+    times: of time.perf_counter(), before the rollout, after it, and after the update. Raises RunError if a file cannot
+    be written or a process is gone, FloatingPointError if a weight is not finite.
     """
+    began, collected, updated = times
+    logs |= {"charts/seconds_collect": collected - began, "charts/seconds_update": updated - collected}
+    logs["charts/seconds_iteration"] = updated - began
     iterations = args.total_timesteps // (args.num_envs * args.num_steps)
     is_last = run.iteration == iterations
     evaluates = run.eval_envs is not None and (run.iteration % args.eval_interval == 0 or is_last)

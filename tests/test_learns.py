@@ -24,9 +24,9 @@ def trained(monkeypatch):
     def train(script, args):
         end_iteration, returns = script.end_iteration, []
 
-        def end_or_stop(args, run, logs, episodes):
+        def end_or_stop(args, run, logs, episodes, times):
             returns.append(np.mean(episodes["charts/episodic_return"]))
-            end_iteration(args, run, logs, episodes)
+            end_iteration(args, run, logs, episodes, times)
             run.stop |= len(returns) >= 5 and np.mean(returns[-5:]) >= 0.95
 
         monkeypatch.setattr(script, "end_iteration", end_or_stop)
