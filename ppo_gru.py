@@ -59,6 +59,7 @@ from ppo_utils.runs import command, end_iteration, open_run, prepare, report_out
 class Args(RunArgs):
     """Train a PPO agent with a recurrent memory."""
 
+    exp_name: str = Path(__file__).stem
     total_timesteps: PositiveInt = 163_840_000
     """environment steps to train for, rounded down to whole iterations of num_envs x num_steps"""
     num_envs: PositiveInt = 32

@@ -72,7 +72,7 @@ class RunArgs:
     """
 
     exp_name: str = ""
-    """name of the experiment, part of the run folder's name (default: the script's name)"""
+    """name of the experiment, part of the run folder's name"""
     preset: Literal["thesis", "laptop", "quickstart"] = "thesis"
     """a set of defaults, listed above; explicit flags override it (in Python: Args(**PRESETS["laptop"]))"""
     seed: NonNegativeInt = 1
@@ -170,7 +170,7 @@ def check_args(args: RunArgs) -> None:
         if is_choice and value not in get_args(kind):
             raise ValueError(f"{flag(name)} is {value!r}; it must be one of {', '.join(get_args(kind))}")
     check_bounds(args)
-    if set(args.exp_name) & set("/\\"):
+    if not args.exp_name or set(args.exp_name) & set("/\\"):
         raise ValueError(f"--exp-name is {args.exp_name!r}; it must be a name without slashes")
     if args.auxiliary_detach and not (args.reconstruction_coef or args.ground_truth_coef):
         raise ValueError("--auxiliary-detach needs --reconstruction-coef or --ground-truth-coef above 0")

@@ -80,7 +80,6 @@ def prepare(args: RunArgs, script: str) -> tuple[Run, dict[str, np.ndarray], dic
         raise ValueError(
             f"the script {script}.py must be named ppo_NAME.py, in letters, digits and _, to be found again"
         )
-    args.exp_name = args.exp_name or script
     join_processes()
     checkpoint = None if args.resume is None else read_checkpoint(args.resume)
     if checkpoint is not None:

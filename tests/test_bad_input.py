@@ -54,7 +54,7 @@ CASES = {
     "--env-id CueRecall-v0 --capture-video": "needs an environment that draws images .*; CueRecall-v0 draws none",
     "--target-kl nan": "--target-kl is nan; it must be above 0",
     "--vf-coef inf": "--vf-coef is inf; it must be 0 or more",
-    "--ground-truth-detach": "--ground-truth-detach needs --ground-truth-coef above 0",
+    "--auxiliary-detach": "--auxiliary-detach needs --reconstruction-coef or --ground-truth-coef above 0",
     "--refresh-memory --update-epochs 1": "--refresh-memory needs --update-epochs above 1: the first epoch has fresh "
     "memory",
     "--memory none --seq-len 5": "--seq-len, --num-layers and --refresh-memory need --memory gru or lstm",
@@ -71,7 +71,6 @@ TRANSFORMER_CASES = {
     "--trxl-memory-length 0": "--trxl-memory-length is 0; it must be 1 or more",
     "--trxl-gate-bias inf": "--trxl-gate-bias is inf; it must be -100 to 100",
     "--trxl-gate-bias 2": "--trxl-gate-bias needs --trxl-gate gru; without, it changes nothing",
-    "--trxl-pe-length 300": "--trxl-pe-length needs --trxl-positional-encoding learned",
     "--num-minibatches 200": "may have only 128 sequences .* at most that many, or more environments",
 }
 

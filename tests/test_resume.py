@@ -285,12 +285,12 @@ def test_a_checkpoint_holds_what_the_next_rollout_begins_with(tiny):
     """Of the transformer's timeline the window, not the rollout; of the GRU's hidden states the last."""
     changes = {"num_steps": 64, "total_timesteps": 256}
     folder = ppo_trxl.main(tiny(ppo_trxl, **GRID, **changes))
-    memory = read_checkpoint(folder)["processes"][0]["memory"]
+    memory = read_checkpoint(folder)["processes"][0]["carry"]["memory"]
     assert {name: tuple(part.shape) for name, part in memory.items()} == {
         "hidden": (7, 4, 2, 32), "row_step": (7, 4), "episode_step": (4,)
     }  # fmt: skip
     folder = ppo_gru.main(tiny(**GRID, **changes))
-    (hidden,) = read_checkpoint(folder)["processes"][0]["memory"].values()
+    (hidden,) = read_checkpoint(folder)["processes"][0]["carry"]["memory"].values()
     assert hidden.shape == (4, 1, 32)
 
 

@@ -39,7 +39,8 @@ def test_flags_differ_in_the_memory_alone():
     assert gru == [*shared, "memory", "hidden_size", "num_layers", "seq_len"]
     assert [name for name in trxl if not name.startswith("trxl_")] == shared
     defaults = [{name: getattr(script.Args(), name) for name in shared} for script in (ppo_gru, ppo_trxl)]
-    assert defaults[0] == defaults[1]
+    assert defaults[0] == {**defaults[1], "exp_name": "ppo_gru"}
+    assert defaults[1]["exp_name"] == "ppo_trxl"
 
 
 def test_flags_of_the_run_are_read_by_no_line_of_a_script():

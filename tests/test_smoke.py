@@ -138,7 +138,7 @@ def test_flags_that_were_renamed(tiny):
     """An older file has them by their former names."""
     args = {"head_size": 7, "seed": 3, "no_longer": 1}
     torch.save({"script": "ppo_gru", "args": args, "weights": {}}, "model.pt")
-    assert saved_args(ppo_gru.Args, read_model("model.pt")) == ppo_gru.Args(trunk_size=7, seed=3)
+    assert saved_args(ppo_gru.Args, read_model("model.pt")) == ppo_gru.Args(trunk_size=7, seed=3, value_init_gain=1.0)
 
 
 def test_weights_that_were_renamed(tiny):
@@ -393,8 +393,12 @@ def test_presets(script):
         args = parse_args(script, "--preset", name)
         assert args == script.Args(**held)
         assert args.preset == name
-        assert args.anneal_steps == args.total_timesteps
         check_args(args)
+        assert args.anneal_steps == args.total_timesteps
+    for flags, steps in (([], 2_000_000), (["--anneal-steps", "7"], 7), (["--anneal-steps", "0"], 0)):
+        args = parse_args(script, "--preset", "laptop", "--total-timesteps", "2e6", *flags)
+        check_args(args)
+        assert args.anneal_steps == steps, "the schedules are as long as the training, unless another length is given"
     held = script.PRESETS["laptop"]
     given = parse_args(script, "--num-steps", "7", "--preset=laptop", "--env-id", "CartPole-v1")
     assert (given.num_steps, given.env_id, given.trunk_size) == (7, "CartPole-v1", held["trunk_size"])
