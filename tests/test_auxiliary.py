@@ -71,10 +71,16 @@ def test_the_losses_are_means_over_real_steps(played, script):
     torch.testing.assert_close(loss, policy + 0.5 * value + 0.1 * drawn + 0.1 * estimated)
 
 
+@pytest.mark.parametrize("ends", [{}, {"num_envs": 1}], ids=str)
 @SCRIPTS
-def test_the_ground_truth_belongs_to_the_observation(played, script):
-    """The same actions, played again: what the infos said when an observation was handed out."""
-    args, run, *_ = played(script=script, env_id="MortarMayhemB-Grid-v0", num_steps=32, num_minibatches=1, **HEADS)
+def test_the_ground_truth_belongs_to_the_observation(played, script, ends):
+    """The same actions, played again: what the infos said when an observation was handed out.
+
+    Also where all environments end in the same step, as one does by itself.
+    """
+    few = {"num_steps": 32, "num_minibatches": 1}
+    args, run, *_ = played(script=script, env_id="MortarMayhemB-Grid-v0", **few, **HEADS, **ends)
+    assert bool(ends) == run.rollout.done.all(1).any()
     envs = envs_for(args, args.num_envs, seed=args.seed)
     _, infos = envs.reset()
     assert run.rollout.terminated.any()

@@ -110,24 +110,28 @@ def test_values_are_clipped_around_the_rollout_s(played, clip_vloss):
     assert logs["value_loss"].item() == pytest.approx(1.9**2 if clip_vloss else 1.0, rel=1e-4)
 
 
-PROBES = {"ground_truth_coef": 100.0, "auxiliary_detach": True}
+PROBES = {"ground_truth_coef": 100.0, "reconstruction_coef": 100.0, "auxiliary_detach": True}
+
+
+PARTS = ("estimator", "decoder")
 
 
 @pytest.mark.parametrize("max_grad_norm", [0.25, 1e9])
 def test_a_gradient_step_is_no_longer_than_its_norm_allows(played, max_grad_norm):
     """By plain gradient descent with rate 1, a step is the gradient; that of a detached head is clipped by itself."""
-    changes = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector", "num_minibatches": 1, "update_epochs": 1}
+    changes = {"env_id": "MortarMayhem-Grid-v0", "num_minibatches": 1, "update_epochs": 1}
     args, run, *_ = played(**changes, **PROBES, max_grad_norm=max_grad_norm)
     rollout, agent = run.rollout, run.agent
     rollout.returns = rollout.values + 100
     before = {name: weight.clone() for name, weight in agent.state_dict().items()}
     (logs,), _ = ppo_gru.update(agent, [torch.optim.SGD(agent.parameters(), lr=1.0)], rollout, 0.0, args)
     steps = {name: (weight - before[name]).flatten() for name, weight in agent.state_dict().items()}
-    for of_probe in (False, True):
-        step = torch.cat([step for name, step in steps.items() if name.startswith("estimator") == of_probe]).norm()
+    for head in ("estimator", "decoder", None):
+        own = [step for name, step in steps.items() if head == next((h for h in PARTS if name.startswith(h)), None)]
+        step = torch.cat(own).norm()
         assert step > 0.2
         assert (step <= max_grad_norm * 1.001) if max_grad_norm < 1 else (step > 2)
-        if not of_probe:
+        if head is None:
             assert logs["grad_norm"] > 2, "what is logged is the norm before it is clipped"
             assert step.item() == pytest.approx(min(max_grad_norm, logs["grad_norm"].item()), rel=1e-3)
 

@@ -422,10 +422,10 @@ REFRESHED = {
 }
 
 
-@pytest.mark.parametrize("ends", REFRESHED)
+@pytest.mark.parametrize(("ends", "amp"), [*((ends, False) for ends in REFRESHED), ("terminated", True)])
 @each_memory(MEMORIES)
-def test_refreshing_with_the_weights_that_acted_changes_nothing(played, ends, memory):
-    args, run, *_ = played(iterations=3, **REFRESHED[ends], **memory)
+def test_refreshing_with_the_weights_that_acted_changes_nothing(played, ends, amp, memory):
+    args, run, *_ = played(iterations=3, amp=amp, **REFRESHED[ends], **memory)
     assert ends == "neither" or getattr(run.rollout, ends).any()
     before = vars(run.rollout.memory)
     refreshed = memory.get("script", ppo_gru).refreshed_memory(run.agent, run.rollout, args)

@@ -167,7 +167,7 @@ def test_unroll_equals_a_window_gathered_for_every_sample(changes):
 @pytest.mark.parametrize("changes", VARIANTS)
 def test_the_gradient_through_a_segment_equals_a_loop_s(changes):
     """The loop takes one step after the other, and keeps what each block was given, with its gradient."""
-    memory = make_memory(trxl_memory_gradient=True, **changes)
+    memory = make_memory(trxl_memory_gradient=True, trxl_num_layers=3, **changes)
     stored = make_timeline(memory)
     pieces = memory.cut(torch.zeros(STEPS, LANES, dtype=torch.bool))
     pieces.length[2] = 3  # padding
@@ -191,7 +191,7 @@ def test_the_gradient_through_a_segment_equals_a_loop_s(changes):
 @pytest.mark.parametrize("gate", ["none", "gru"])
 def test_how_far_the_gradient_reaches(gate):
     """To the segment's first step, within the window of each block and the episode."""
-    memory = make_memory(trxl_memory_gradient=True, trxl_gate=gate, trxl_memory_length=3)
+    memory = make_memory(trxl_memory_gradient=True, trxl_gate=gate, trxl_memory_length=2, trxl_num_layers=3)
     stored = make_timeline(memory)
     stored.row_step[:] = torch.arange(100, 100 + len(stored.row_step))[:, None]  # an episode that goes on
     stored.row_step[memory.window + 12 :, 1] -= 100 + memory.window + 12  # in environment 1, one begins at step 12
@@ -207,11 +207,11 @@ def test_how_far_the_gradient_reaches(gate):
         assert (touched % LANES == lane).all()
         return sorted((touched // LANES).tolist())
 
-    assert reached(15, 0) == [9, 10, 11, 12, 13, 14, 15], "two blocks, each with a window of 3"
+    assert reached(15, 0) == [9, 10, 11, 12, 13, 14, 15], "three blocks, each with a window of 2"
     assert reached(11, 0) == [8, 9, 10, 11], "the segment of 8 steps begins at 8"
     assert reached(14, 1) == [12, 13, 14], "another episode"
     assert reached(12, 1) == [12]
-    plain = make_memory(trxl_gate=gate, trxl_memory_length=3)
+    plain = make_memory(trxl_gate=gate, trxl_memory_length=2, trxl_num_layers=3)
     y = plain.unroll(stored, x, pieces)
     assert reached(15, 0) == [15]
 
