@@ -29,6 +29,8 @@ def moved(value, device):
     """Return a copy of a dataclass, a dict or a tensor on another device; what lies on the CPU by design stays."""
     if isinstance(value, torch.Tensor):
         return value.to(device) if value.is_cuda else value
+    if isinstance(value, list):
+        return [moved(part, device) for part in value]
     if isinstance(value, dict):
         return {name: moved(part, device) for name, part in value.items()}
     if is_dataclass(value):

@@ -152,7 +152,7 @@ def test_processes_have_the_same_weights_and_other_global_generators(tiny, monke
     drawn = []
     for rank in (0, 1, 2):
         monkeypatch.setattr(runs, "rank_and_size", lambda rank=rank: (rank, 3))
-        runs.prepare(tiny(), "ppo_gru", 16)
+        runs.prepare(tiny(env_id="CueRecall-v0"), "ppo_gru")[0].envs.close()
         drawn.append((torch.rand(1).item(), np.random.rand(), random.random()))  # noqa: NPY002
     assert [len({*each}) for each in zip(*drawn, strict=True)] == [1, 3, 3]
 
