@@ -29,12 +29,12 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
 
-import evaluate
 import learning
 import suites
 import tables
+from ppo_utils.run_logs import RunLog, align
 from suites import Task
 from tables import LEVEL, Comparison
 
@@ -51,27 +51,27 @@ WIDE_TASKS = {*suites.FULL, "endless-long"}  # here, transformers have about as 
 
 
 # What is compared, (R, M): of each seed, on each of the development levels, which all runs have.
-def at_the_end(name: str, runs: list[evaluate.RunLog]) -> np.ndarray:
+def at_the_end(name: str, runs: list[RunLog]) -> np.ndarray:
     """Return the scores of the final weights, by the name of a metric or score."""
-    return evaluate.align([run.curves[f"eval/{name}"] for run in runs])[1][-1].mean(-1)
+    return align([run.curves[f"eval/{name}"] for run in runs])[1][-1].mean(-1)
 
 
-def score(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
+def score(task: Task, runs: list[RunLog]) -> np.ndarray:
     """Return the task's scores of the final weights."""
     return at_the_end(task.score, runs)
 
 
-def area(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
+def area(task: Task, runs: list[RunLog]) -> np.ndarray:
     """Return the means of the learning curves: they are higher where fewer samples are needed."""
-    return evaluate.align([run.curves[f"eval/{task.score}"] for run in runs])[1].mean((0, -1))
+    return align([run.curves[f"eval/{task.score}"] for run in runs])[1].mean((0, -1))
 
 
-def falls(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
+def falls(task: Task, runs: list[RunLog]) -> np.ndarray:
     """Return how often the final weights fall off."""
     return at_the_end("num_fails", runs)
 
 
-def gradient_norm(task: Task, runs: list[evaluate.RunLog]) -> np.ndarray:
+def gradient_norm(task: Task, runs: list[RunLog]) -> np.ndarray:
     """Return the mean norms of the gradients before they are clipped, (R, 1)."""
     return np.array([[run.curves["losses/grad_norm"][1].mean()] for run in runs])
 
@@ -86,7 +86,7 @@ class Claim:
     task: str
     higher: tuple[str, ...]
     lower: tuple[str, ...]
-    measure: Callable[[Task, list[evaluate.RunLog]], np.ndarray] = score
+    measure: Callable[[Task, list[RunLog]], np.ndarray] = score
     text: str = ""  # where neither the claim's name nor its table's title says it
     flags: str = ""  # of all agents
     expects_difference: bool = True
@@ -103,7 +103,7 @@ class Claim:
         trained = " ".join([name, *self.flags.split(), *(f"--{flags}" for flags in own), *wide])
         return [learning.plan(config, TASKS[self.task], trained, seed) for seed in config.seeds]
 
-    def numbers(self, runs: list[evaluate.RunLog]) -> np.ndarray:
+    def numbers(self, runs: list[RunLog]) -> np.ndarray:
         """Return what is compared, (R, M)."""
         return self.measure(TASKS[self.task], runs)
 
@@ -265,7 +265,7 @@ def verdict(claim: Claim, pairs: list[Comparison]) -> Verdict:
     return Verdict("not decided")
 
 
-def is_learned(claim: Claim, runs: dict[str, list[evaluate.RunLog]], without: list[evaluate.RunLog]) -> bool:
+def is_learned(claim: Claim, runs: dict[str, list[RunLog]], without: list[RunLog]) -> bool:
     """Return whether any agent of the claim scores higher than one without memory, if there are runs of that.
 
     An agent without memory that is one of the claim's has to be passed by another.
@@ -301,7 +301,7 @@ def mean_and_error(numbers: np.ndarray) -> str:
     return tables.mean_and_error(numbers[..., None]).replace(" ", "")
 
 
-def row(table: Table, name: str, runs: dict[str, list[evaluate.RunLog]], found: str) -> str:
+def row(table: Table, name: str, runs: dict[str, list[RunLog]], found: str) -> str:
     """Return a claim's row, from the seeds of its agents: their means and standard errors, bold if expected higher."""
     claim = table.claims[name]
     numbers = {agent: mean_and_error(claim.numbers(runs[agent])) for agent in claim.agents}
@@ -318,7 +318,7 @@ def row(table: Table, name: str, runs: dict[str, list[evaluate.RunLog]], found: 
     return f"| {' | '.join([*cells, found])} |"
 
 
-def judge(claim: Claim, runs: dict[str, list[evaluate.RunLog]], without: list[evaluate.RunLog]) -> Verdict:
+def judge(claim: Claim, runs: dict[str, list[RunLog]], without: list[RunLog]) -> Verdict:
     """Return the verdict on a claim, from the runs of its agents and, if they are there, of one without memory."""
     if not is_learned(claim, runs, without):
         return Verdict("not learned")
@@ -327,7 +327,7 @@ def judge(claim: Claim, runs: dict[str, list[evaluate.RunLog]], without: list[ev
     return verdict(claim, [Comparison.of(numbers[one], numbers[other]) for one, other in pairs])
 
 
-def finished(config: Config, plans: list[learning.Plan], results: dict) -> list[evaluate.RunLog]:
+def finished(config: Config, plans: list[learning.Plan], results: dict) -> list[RunLog]:
     """Return the runs that are there; `results` keeps what has been read, by the plans' commands."""
     for plan in plans:
         if plan.command not in results:

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
 
-from evaluate import RESAMPLES, interval, iqm
+from ppo_utils.scores import RESAMPLES, interval, iqm
 
 LEVELS, REPEATS, EXPERIMENTS = 50, 3, 400
 

@@ -20,6 +20,7 @@ import contextlib
 import csv
 import functools
 import glob
+import gzip
 import importlib
 import json
 import math
@@ -42,20 +43,23 @@ import torch
 import tyro
 from tqdm import tqdm
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
 
-import evaluate
 import tables
 from ppo_utils.checkpoints import read_model
 from ppo_utils.evaluation import first_unseen
 from ppo_utils.flags import PositiveInt, bounded, check_args, check_bounds, check_minibatches
+from ppo_utils.run_logs import SECONDS, NoCurvesError, RunLog, Runs, align, read_run
 from ppo_utils.runs import parse_args
+from ppo_utils.scores import own_metric
 from suites import AGENTS, SUITES, TASKS, Task, short
 
 ROOT = Path(__file__).parent.parent
 # The results were trained when 1 was the default of --value-init-gain. An agent's own flags override these.
 COMMON = "--preset laptop --save-model --value-init-gain 1"
 FIRST_TEST_LEVEL = 1_000_000
+# Scalars that tell how an iteration's update went.
+UPDATE_CURVES = ("losses/grad_norm", "losses/entropy", "charts/gradient_steps", "charts/learning_rate")
 
 
 @dataclass
@@ -187,17 +191,17 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
     return Plan(task, agent, seed, (sys.executable, str(ROOT / script), *flags), args)
 
 
-def runs_in(place: str, plan: Plan) -> list[evaluate.RunLog]:
+def runs_in(place: str, plan: Plan) -> list[RunLog]:
     """Return the runs that were planned so among the folders, or the files of results, in a place."""
     wanted = plan.logged_args()
     found = []
     for path in sorted(glob.glob(f"{place}/{plan.task.env_id}__{file_name(plan.agent)}__{plan.seed}__*")):
-        with contextlib.suppress(evaluate.NoCurvesError):
-            found.append(evaluate.read_run(path))
+        with contextlib.suppress(NoCurvesError):
+            found.append(read_run(path))
     return [run for run in found if {**run.args, "resume": "None"} == wanted]
 
 
-def result_of(config: Training, plan: Plan) -> evaluate.RunLog | None:
+def result_of(config: Training, plan: Plan) -> RunLog | None:
     """Return the finished run, if its result is there, with the curve `eval/{plan.task.score}`."""
     run = next(iter(runs_in(f"{config.results}/{plan.task.env_id}", plan)), None)
     if run is not None and plan.task.best_return is not None:
@@ -208,13 +212,13 @@ def result_of(config: Training, plan: Plan) -> evaluate.RunLog | None:
     return run
 
 
-def has_all_steps(run: evaluate.RunLog) -> bool:
+def has_all_steps(run: RunLog) -> bool:
     """Return whether a run has trained for all its steps."""
     total, *batch = (int(run.args[name]) for name in ("total_timesteps", "num_envs", "num_steps"))
     return run.has_seconds() and run.last_step + math.prod(batch) > total
 
 
-def is_complete(run: evaluate.RunLog) -> bool:
+def is_complete(run: RunLog) -> bool:
     """Return whether the run of a folder has all its steps and has written its final weights, not just earlier ones."""
     model = Path(run.path) / "model.pt"
     return has_all_steps(run) and model.is_file() and read_model(model)["step"] == run.last_step
@@ -224,8 +228,8 @@ def expected_hours(config: Training, missing: list[Plan]) -> str:
     """Return about how many hours the trainings take, by the results of the same scripts that are there; or nothing."""
     speeds = {}
     for path in config.results.glob("*/*.json.gz"):
-        with contextlib.suppress(evaluate.NoCurvesError):
-            run = evaluate.read_run(str(path))
+        with contextlib.suppress(NoCurvesError):
+            run = read_run(str(path))
             if run.has_seconds():
                 speeds.setdefault(run.args["script"], []).append(run.last_step / run.seconds("iteration").sum())
     scripts = [Path(plan.command[1]).stem for plan in missing]
@@ -310,10 +314,38 @@ def write_result(config: Training, plan: Plan) -> None:
         )
     result = config.results / plan.task.env_id / f"{Path(run.path).name}.json.gz"
     result.parent.mkdir(parents=True, exist_ok=True)
-    evaluate.write_run(replace(run, curves=curves, machine=machine()), str(result))
+    write_run(replace(run, curves=curves, machine=machine()), str(result))
 
 
-def test_scores(config: Training, plan: Plan, run: evaluate.RunLog) -> dict[str, tuple[list[int], np.ndarray]]:
+def write_run(run: RunLog, path: str) -> None:
+    """Write what tables and pictures need, in a few KB; `read_run` reads it as it reads the run's folder.
+
+    That is the machine, the arguments, the evaluations in the family's own metric, return, length and falls, those on
+    test levels too, the seconds of each iteration, and the curves UPDATE_CURVES, averaged to POINTS. Steps are kept as
+    differences, which compress better.
+    """
+    metrics = (own_metric(run.args["env_id"]), "return", "length", "num_fails")
+    names = [f"{levels}/{name}" for levels in ("eval", "test") for name in metrics]
+    kept = {name: run.curves[name] for name in (*dict.fromkeys(names), *SECONDS.values()) if name in run.curves}
+    for name in UPDATE_CURVES:
+        if name in run.curves:
+            steps, values = align([run.curves[name]])  # (P,), (P, R, M, E) with R = M = E = 1
+            kept[name] = steps, values[:, 0]
+    four_digits = np.vectorize(lambda value: float(f"{value:.4g}"))  # also of small norms; scores have few digits
+    curves = {
+        name: (np.diff(steps, prepend=0).tolist(), (values if name in names else four_digits(values)).tolist())
+        for name, (steps, values) in kept.items()
+    }
+    part = Path(f"{path}.part")
+    try:
+        with gzip.open(part, "wt") as file:
+            json.dump({"machine": run.machine, "args": run.args, "curves": curves}, file, separators=(",", ":"))
+        os.replace(part, path)  # a file that is there is complete
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def test_scores(config: Training, plan: Plan, run: RunLog) -> dict[str, tuple[list[int], np.ndarray]]:
     """Let the run's final weights play the test levels; return a curve of one point for each metric.
 
     Raises SystemExit if that fails.
@@ -408,7 +440,7 @@ def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
     }
 
 
-def results_of(config: Config, plans: dict[tuple[str, str, int], Plan]) -> dict[str, evaluate.Runs]:
+def results_of(config: Config, plans: dict[tuple[str, str, int], Plan]) -> dict[str, Runs]:
     """Return the finished runs by task and agent: a list for each, empty where there is no result."""
     tasks = {task: {} for task, _, _ in plans}
     for (task, agent, _), each in plans.items():
@@ -426,7 +458,7 @@ def write_csv(results: Path, path: Path) -> int:
         table = csv.writer(file)
         table.writerow((*names, "levels", "metric", "step", "hours", "mean", "episodes"))
         for each in files:
-            run = evaluate.read_run(str(each))
+            run = read_run(str(each))
             for curve, (steps, scores) in run.curves.items():
                 levels, _, metric = curve.partition("/")
                 if levels in ("eval", "test"):
@@ -470,7 +502,7 @@ if __name__ == "__main__":
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     try:
         main(tyro.cli(Config))
-    except (OSError, evaluate.NoCurvesError) as error:
+    except (OSError, NoCurvesError) as error:
         sys.exit(f"learning.py: {error}")
     except KeyboardInterrupt:
         sys.exit(130)

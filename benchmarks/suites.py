@@ -4,7 +4,7 @@ import json
 import re
 from dataclasses import dataclass, field, replace
 
-import evaluate
+from ppo_utils.scores import own_metric
 
 # What --preset laptop was until Muon: the agents of the suites small and full have these settings.
 ADAMW = "--optimizer adamw --no-norm-reward --num-envs 32 --update-epochs 4 --num-minibatches 8"
@@ -66,7 +66,7 @@ class Task:
     @property
     def metric(self) -> str:
         """Return the name of the family's own metric (6.1.3)."""
-        return evaluate.own_metric(self.env_id)
+        return own_metric(self.env_id)
 
     @property
     def best_return(self) -> float | None:

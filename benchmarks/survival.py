@@ -27,11 +27,11 @@ import numpy as np
 import torch
 import tyro
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
 
-import evaluate
 from ppo_utils.checkpoints import checkpoints_in, save_checkpoint
 from ppo_utils.flags import NonNegativeFloat, NonNegativeInt, PositiveInt, check_bounds
+from ppo_utils.run_logs import read_run
 from ppo_utils.runs import close, parse_args
 
 FLAGS = "--preset laptop --env-id MysteryPath-Grid-v0 --num-envs 4 --num-steps 32 --num-minibatches 2 --no-cuda"
@@ -89,7 +89,7 @@ def comes_to_its_end(script: str, flags: list[str], seconds: float | None) -> bo
 
 def scalars(folder: Path) -> dict[str, list]:
     """Return the curves of a run, of each level where it was evaluated, but for what a clock measures."""
-    curves = evaluate.read_run(str(folder)).curves
+    curves = read_run(str(folder)).curves
     kept = [name for name in curves if not name.startswith(("charts/SPS", "charts/seconds"))]
     return {name: [array.tolist() for array in curves[name]] for name in kept}
 

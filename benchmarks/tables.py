@@ -1,6 +1,6 @@
 """Tables and pictures of what agents reached, and how they compare over several tasks.
 
-Shape letters, beside those of evaluate.py (R seeds, M levels, E episodes, P points of a curve, B resamples): T tasks.
+Shape letters, R seeds, M levels, E episodes, P points of a curve, B resamples, T tasks.
 """
 
 import csv
@@ -18,7 +18,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-import evaluate
+from ppo_utils.run_logs import RunLog, Runs, align
+from ppo_utils.scores import RESAMPLES, iqm
 from suites import COLORS, TASKS, Task
 
 BOUNDS, THESIS = (Path(__file__).with_name(name) for name in ("bounds.csv", "thesis.csv"))
@@ -47,32 +48,60 @@ def read_thesis() -> dict[str, str]:
         return {row["task"]: f"{row['GRU']}, {row['TrXL']}" for row in csv.DictReader(file)}
 
 
-def final_scores(name: str, runs: list[evaluate.RunLog]) -> np.ndarray:
+def final_scores(name: str, runs: list[RunLog]) -> np.ndarray:
     """Return the scores (R, M, E) of the seeds' final weights, by the name of a metric or score.
 
     They are those on the test levels, or where a run has none, on the development levels.
     """
     levels = "test" if are_tested(name, runs) else "eval"
-    return evaluate.align([run.curves[f"{levels}/{name}"] for run in runs])[1][-1]
+    return align([run.curves[f"{levels}/{name}"] for run in runs])[1][-1]
 
 
-def are_tested(name: str, runs: list[evaluate.RunLog]) -> bool:
+def are_tested(name: str, runs: list[RunLog]) -> bool:
     """Return whether all of the seeds have the metric or score on the test levels."""
     return all(f"test/{name}" in run.curves for run in runs)
 
 
+def standard_error(scores: np.ndarray) -> float:
+    """Return the standard error of the mean of scores (R, M, E), for other seeds and other levels.
+
+    All seeds play the same levels, so the variance of the mean has two parts, `seed_variance` and that of the levels'
+    means over M (a two-way model with random effects). A bootstrap over seeds and levels estimates the same, but with
+    three seeds has two thirds of the first part. With one seed, NaN.
+    """
+    means = scores.mean(2)  # (R, M)
+    return math.sqrt(seed_variance(means) + level_variance(means.mean(0))) if len(means) > 1 else math.nan
+
+
+def seed_variance(means: np.ndarray) -> float:
+    """Return the part of the variance of the mean of (R, M) that differences between seeds have.
+
+    The seeds' means also vary by what a seed does on these levels more than on others. `level_variance` has that part
+    too, so that it is subtracted here.
+    """
+    seeds, levels = means.shape
+    alone = means - means.mean(1, keepdims=True) - means.mean(0) + means.mean()  # what only that seed and level have
+    both = (alone**2).sum() / ((seeds - 1) * (levels - 1)) / means.size if levels > 1 else 0.0
+    return max(means.mean(1).var(ddof=1) / seeds - both, 0.0)
+
+
+def level_variance(means: np.ndarray) -> float:
+    """Return the variance of the mean of levels (M,); of a single level, 0."""
+    return means.var(ddof=1) / len(means) if len(means) > 1 else 0.0
+
+
 def mean_and_error(scores: np.ndarray) -> str:
     """Return the mean of scores (R, M, E) with its standard error, if there are several seeds."""
-    error = evaluate.standard_error(scores)
+    error = standard_error(scores)
     return f"{scores.mean():.2f}" + ("" if math.isnan(error) else f" ± {error:.2f}")
 
 
-def minutes_of(runs: list[evaluate.RunLog]) -> float:
+def minutes_of(runs: list[RunLog]) -> float:
     """Return the mean duration of trainings, without evaluations."""
     return float(np.mean([run.seconds("iteration").sum() for run in runs])) / 60
 
 
-def best_of(task: Task, agents: evaluate.Runs) -> float:
+def best_of(task: Task, agents: Runs) -> float:
     """Return the best possible score, or where there is no bound the highest mean of these agents."""
     return task.best_score or max(float(final_scores(task.score, runs).mean()) for runs in agents.values() if runs)
 
@@ -100,7 +129,7 @@ class Comparison:
         if min(len(higher), len(lower)) < 2:
             return cls(0.0, 1.0)
         levels = higher.mean(0) - lower.mean(0)  # (M,)
-        parts = [evaluate.seed_variance(higher), evaluate.seed_variance(lower), evaluate.level_variance(levels)]
+        parts = [seed_variance(higher), seed_variance(lower), level_variance(levels)]
         freedom = [len(higher) - 1, len(lower) - 1, max(len(levels) - 1, 1)]
         difference, variance = levels.mean(), sum(parts)
         if not variance:
@@ -111,7 +140,7 @@ class Comparison:
 
 
 # ---- ONE TASK ----
-def table(task: Task, agents: evaluate.Runs) -> str:
+def table(task: Task, agents: Runs) -> str:
     """Return a task's table, a row for each agent that has runs, and below it what these took and on which machines."""
     runs_of = {agent: runs for agent, runs in agents.items() if runs}
     best = best_of(task, runs_of)
@@ -134,7 +163,7 @@ def table(task: Task, agents: evaluate.Runs) -> str:
     return "\n".join(lines)
 
 
-def row(agent: str, runs_of: evaluate.Runs, task: Task, best: float) -> str:
+def row(agent: str, runs_of: Runs, task: Task, best: float) -> str:
     """Return the agent's row: its score, that of each seed, which agents it is ahead of, and how it learned.
 
     That is the largest drop, how far a seed's mean is below an earlier one, and the minutes to 0.5 and 0.9 of `best`,
@@ -142,11 +171,11 @@ def row(agent: str, runs_of: evaluate.Runs, task: Task, best: float) -> str:
     """
     runs = runs_of[agent]
     scores = final_scores(task.score, runs)  # (R, M, E)
-    steps, curve = evaluate.align([run.curves[f"eval/{task.score}"] for run in runs])  # (P,), (P, R, M, E)
+    steps, curve = align([run.curves[f"eval/{task.score}"] for run in runs])  # (P,), (P, R, M, E)
     minutes = 60 * np.mean([run.hours(steps) for run in runs], 0)  # (P,)
     means = curve.mean((-2, -1))  # (P, R)
     drop = (np.maximum.accumulate(means) - means).max()
-    cells = [agent, mean_and_error(scores), f"{evaluate.iqm(scores):.2f}"]
+    cells = [agent, mean_and_error(scores), f"{iqm(scores):.2f}"]
     cells.append(", ".join(f"{mean:.2f}" for mean in scores.mean((1, 2))))
     if task.score != task.metric:
         cells.append(f"{final_scores(task.metric, runs).mean():.2f}")
@@ -166,7 +195,7 @@ def is_ahead(scores: np.ndarray, others: np.ndarray) -> bool:
 
 
 # ---- ALL TASKS ----
-def overview(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds], thesis: dict[str, str]) -> str:
+def overview(tasks: dict[str, Runs], bounds: dict[str, Bounds], thesis: dict[str, str]) -> str:
     """Return a table with a row for each task: the mean score of each agent's final weights, and its standard error.
 
     Beside it stand the scores of random actions, of the scripted player and in the thesis, the steps of a training, and
@@ -176,7 +205,7 @@ def overview(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds], thesis:
     names = [*dict.fromkeys(agent for agents in tasks.values() for agent in agents)]
     most = max(len(runs) for agents in tasks.values() for runs in agents.values())
 
-    def cell(task: Task, runs: list[evaluate.RunLog]) -> str:
+    def cell(task: Task, runs: list[RunLog]) -> str:
         if not runs:
             return ""
         few = f", {len(runs)} seed{'s' * (len(runs) > 1)}" if len(runs) < most else ""
@@ -202,7 +231,7 @@ def overview(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds], thesis:
     return "\n".join(lines)
 
 
-def aggregate(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds]) -> str:
+def aggregate(tasks: dict[str, Runs], bounds: dict[str, Bounds]) -> str:
     """Return a table over all tasks, a row an agent: its normalized IQM, and how probably it is better than `RIVALS`.
 
     After Agarwal et al. (2021), "Deep Reinforcement Learning at the Edge of the Statistical Precipice". A seed's mean
@@ -222,7 +251,7 @@ def aggregate(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds]) -> str
         means = np.array([final_scores(TASKS[name].score, runs).mean((1, 2)) for runs in agents.values()])
         normalized[:, i] = (means - low) / (high - low)
     seeds = normalized.shape[-1]
-    drawn = np.random.default_rng(0).integers(seeds, size=(len(names), evaluate.RESAMPLES, len(tasks), seeds))
+    drawn = np.random.default_rng(0).integers(seeds, size=(len(names), RESAMPLES, len(tasks), seeds))
     resampled = np.take_along_axis(normalized[:, None], drawn, -1)  # (agents, B, T, R)
 
     def cell(value: np.ndarray, values: np.ndarray) -> str:
@@ -233,7 +262,7 @@ def aggregate(tasks: dict[str, evaluate.Runs], bounds: dict[str, Bounds]) -> str
     header = ["agent", "normalized IQM", *(f"better than {rival}" for rival in rivals)]
     lines = [f"| {' | '.join(header)} |", f"|---|{'---:|' * (len(header) - 1)}"]
     for name, scores, resamples in zip(names, normalized, resampled, strict=True):
-        cells = [cell(evaluate.iqm(scores[..., None]), evaluate.iqm(resamples[..., None]))]
+        cells = [cell(iqm(scores[..., None]), iqm(resamples[..., None]))]
         for rival in rivals:
             i = names.index(rival)
             same = rival == name
@@ -249,7 +278,7 @@ def better(scores: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 # ---- PICTURE ----
-def draw(tasks: dict[str, evaluate.Runs], out: Path) -> None:
+def draw(tasks: dict[str, Runs], out: Path) -> None:
     """Draw each task's curves on development levels, the mean and its standard error, with names at their ends.
 
     An axis goes from 0 to the best possible score, or where there is no bound to a bit above the highest curve.
@@ -270,13 +299,13 @@ def draw(tasks: dict[str, evaluate.Runs], out: Path) -> None:
     figure.savefig(out, dpi=110)
 
 
-def draw_task(axis: Axes, task: Task, agents: evaluate.Runs, colors: dict[str, Any]) -> None:
+def draw_task(axis: Axes, task: Task, agents: Runs, colors: dict[str, Any]) -> None:
     """Draw the curves of one task's agents."""
     ends, top = {}, 0.0
     for agent, runs in agents.items():
-        x, scores = evaluate.align([run.curves[f"eval/{task.score}"] for run in runs])  # (P,), (P, R, M, E)
+        x, scores = align([run.curves[f"eval/{task.score}"] for run in runs])  # (P,), (P, R, M, E)
         means = scores.mean((1, 2, 3))
-        errors = np.nan_to_num([evaluate.standard_error(each) for each in scores])
+        errors = np.nan_to_num([standard_error(each) for each in scores])
         axis.plot(x, means, color=colors[agent], linewidth=1.5)
         axis.fill_between(x, means - errors, means + errors, color=colors[agent], alpha=0.2, linewidth=0)
         ends[agent], top = (x[-1], means[-1]), max(top, (means + errors).max())

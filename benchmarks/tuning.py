@@ -19,11 +19,11 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
 
-import evaluate
 import learning
 import tables
+from ppo_utils.run_logs import align, read_run
 from suites import LAPTOP, TASKS, WIDE
 
 RESULTS, SPEEDS = (Path(__file__).with_name(name) for name in ("results", "steps_per_second.csv"))
@@ -71,7 +71,7 @@ def measure_speeds(tasks: tuple[str, ...]) -> None:
                 env = {**os.environ, "OMP_NUM_THREADS": "1"}
                 subprocess.run([*plan.command, *flags], check=True, cwd=folder, env=env)
                 (run,) = (Path(folder) / "runs").iterdir()
-                speeds[task, script, preset] = evaluate.read_run(str(run)).curves["charts/SPS"][1][-1].item()
+                speeds[task, script, preset] = read_run(str(run)).curves["charts/SPS"][1][-1].item()
     with SPEEDS.open("w", newline="") as file:  # at the end: a failed training loses nothing
         in_order = sorted(speeds.items(), key=lambda each: [*LAPTOP].index(each[0][0]))
         rows = [(*key, round(speed)) for key, speed in in_order]
@@ -100,9 +100,7 @@ def table(speeds: dict[tuple[str, str, str], float]) -> str:
         if lacking := [" with ".join(key) for key, runs in runs_of.items() if not runs]:
             raise SystemExit(f"{RESULTS} has no results of {lacking[0]} in {name}; learning.py trains what is missing")
         task = TASKS[name]
-        curves = {
-            key: evaluate.align([run.curves[f"eval/{task.score}"] for run in runs]) for key, runs in runs_of.items()
-        }
+        curves = {key: align([run.curves[f"eval/{task.score}"] for run in runs]) for key, runs in runs_of.items()}
         best = task.best_score or max(scores[-1].mean() for _, scores in curves.values())
         for script in ("ppo_trxl.py", "ppo_gru.py"):
             muon, adamw = curves[script, "Muon"], curves[script, "AdamW"]

@@ -22,6 +22,7 @@ from ppo_utils.errors import RunError
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
 
 import evaluate
+from ppo_utils.scores import iqm, own_metric
 
 
 @dataclass
@@ -49,7 +50,7 @@ def row(checkpoint: evaluate.Checkpoint, window: int, metric: str, settings: eva
         raise ValueError(f"with a window of {window}, --max-steps {limit} cut episodes short; give more steps")
     scores, lengths = played[metric], played["length"]
     name = f"{window}, as trained" if window == checkpoint.args.trxl_memory_length else str(window)
-    score = f"{scores.mean():.2f} | {evaluate.iqm(scores[None]):.2f}"
+    score = f"{scores.mean():.2f} | {iqm(scores[None]):.2f}"
     return f"| {name} | {score} | {np.median(lengths):.0f} | {lengths.max():.0f} |"
 
 
@@ -64,7 +65,7 @@ def main(config: Config) -> None:
     if not hasattr(checkpoint.args, "trxl_memory_length"):
         script = checkpoint.script.__name__
         raise ValueError(f"{config.checkpoint} was trained by {script}.py; only transformers have a window")
-    metric = evaluate.own_metric(checkpoint.args.env_id)
+    metric = own_metric(checkpoint.args.env_id)
     rows = [row(checkpoint, window, metric, settings) for window in tqdm(config.windows, unit=" windows")]
     print(f"| window | {metric}, mean | IQM | length of an episode, median | longest |\n|---:|---:|---:|---:|---:|")
     print("\n".join(rows))

@@ -23,12 +23,12 @@ import torch
 import tyro
 from torch.distributed import run as torchrun
 
-import evaluate
 import learning
 import memory_gym_envs  # noqa: F401 (registers the ids)
 import ppo_gru
 import ppo_trxl
 from ppo_utils import flags, runs
+from ppo_utils.scores import own_metric
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -309,4 +309,4 @@ def test_what_an_episode_ends_with():
         assert info["ground_truth"].shape == (int(size),)
         keys = re.findall(r"`(\w+)`", text)
         assert {*keys, "reward", "length", "ground_truth"} == set(info)
-        assert keys[0] == evaluate.own_metric(env_id).replace("return", "reward")
+        assert keys[0] == own_metric(env_id).replace("return", "reward")

@@ -25,7 +25,6 @@ from selenium.webdriver.support.ui import Select, WebDriverWait
 from test_environments import register
 
 import enjoy
-import evaluate
 import memory_gym_envs
 import ppo_gru
 import ppo_trxl
@@ -33,6 +32,7 @@ from memory_gym_envs.character import PAD
 from memory_gym_envs.mystery_path.state import ROWS
 from ppo_utils.environments import as_tensors, envs_for, is_memory_gym
 from ppo_utils.evaluation import make_agent
+from ppo_utils.scores import own_metric
 
 AGENTS = {
     "GRU": (ppo_gru, {"env_id": "MysteryPath-Grid-v0", "reconstruction_coef": 0.1, "ground_truth_coef": 0.1}),
@@ -199,7 +199,7 @@ def test_actions_do_what_the_page_calls_them(env_id):
 def test_ids_with_their_namespace(env_id):
     name = f"memory_gym_envs/{env_id}"
     assert is_memory_gym(name)
-    assert evaluate.own_metric(name) == evaluate.own_metric(env_id)
+    assert own_metric(name) == own_metric(env_id)
     assert enjoy.family_of(name) == enjoy.family_of(env_id) is not None
     branches = [np.ones(3), np.ones(3)] if "MultiDiscrete" in str(gym.make(env_id).action_space) else [np.ones(4)]
     assert enjoy.branch_names(name, branches) == enjoy.branch_names(env_id, branches)

@@ -22,10 +22,15 @@ import evaluate
 import memory_gym_envs
 import ppo_gru
 import ppo_trxl
+from learning import write_run
 from ppo_utils import evaluation
 from ppo_utils.checkpoints import load_weights, read_model, saved_args
+from ppo_utils.curves import curve_name, draw_curves, draw_metric, draw_tasks, wall_time
 from ppo_utils.environments import envs_for
 from ppo_utils.evaluation import make_agent
+from ppo_utils.run_logs import POINTS, SECONDS, align, read_run
+from ppo_utils.scores import RESAMPLES, agents_of, interval, iqm, own_metric, summary, table, task_of, tasks_of
+from tables import standard_error
 
 TASK = {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "num_levels": 10, "start_level": 5, "save_model": True}
 FEW = {"levels": 4, "repeats": 2, "cuda": False}
@@ -44,15 +49,15 @@ FEW = {"levels": 4, "repeats": 2, "cuda": False}
 )
 @pytest.mark.parametrize("shape", [(-1, 1), (1, -1)], ids=["levels", "episodes"])
 def test_interquartile_mean(scores, middle, shape):
-    assert evaluate.iqm(np.array(scores, float).reshape(len(scores), *shape)) == middle
+    assert iqm(np.array(scores, float).reshape(len(scores), *shape)) == middle
 
 
 def test_interval_by_hand():
     """The IQM of four is the mean of the middle two: 0 if at least three are the worst seed's (5 %)."""
-    assert evaluate.interval(np.array([[[0.0]], [[4.0]], [[8.0]], [[100.0]]])).tolist() == [0, 100]
+    assert interval(np.array([[[0.0]], [[4.0]], [[8.0]], [[100.0]]])).tolist() == [0, 100]
     # Two seeds, drawn whole: both the bad one (25 %), or both the good one (25 %). Drawn separately for each of the six
     # levels, an IQM of 0 would need at least nine of twelve to be bad (7 %), one of 1 as many good ones.
-    assert evaluate.interval(np.array([[[0.0]] * 6, [[1.0]] * 6])).tolist() == [0, 1]
+    assert interval(np.array([[[0.0]] * 6, [[1.0]] * 6])).tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("scores", [[[0, 2], [4, 10], [5, 6], [1, 9]], [[0], [0], [3], [4], [8]]])
@@ -65,14 +70,14 @@ def test_interval_is_that_of_all_resamples(scores):
     every = [middle([score for seed in seeds for score in seed]) for seeds in drawn]
     low, high = np.quantile(every, [0.025, 0.975])
     assert min(every) < high < max(every), "the case tells the 95 % interval from the whole range"
-    assert evaluate.interval(np.array(scores, float)[..., None]) == pytest.approx([low, high])
+    assert interval(np.array(scores, float)[..., None]) == pytest.approx([low, high])
 
 
 def test_standard_error_by_hand():
     """Seeds' means 2 and 4 have a variance of 2, levels' means 1, 3 and 5 one of 4."""
     scores = np.array([[0.0, 2.0, 4.0], [2.0, 4.0, 6.0]])[..., None].repeat(5, axis=-1)  # (2, 3, 5)
-    assert evaluate.standard_error(scores) == pytest.approx(np.sqrt(2 / 2 + 4 / 3))
-    assert np.isnan(evaluate.standard_error(scores[:1]))
+    assert standard_error(scores) == pytest.approx(np.sqrt(2 / 2 + 4 / 3))
+    assert np.isnan(standard_error(scores[:1]))
 
 
 def test_standard_error_is_that_of_repeated_experiments():
@@ -80,29 +85,29 @@ def test_standard_error_is_that_of_repeated_experiments():
     rng = np.random.default_rng(0)
     seeds, levels = rng.normal(0, 2, (4000, 3, 1, 1)), rng.normal(0, 5, (4000, 1, 50, 1))
     experiments = seeds + levels + rng.normal(0, 6, (4000, 3, 50, 1))  # what a seed does on one level alone
-    errors = [evaluate.standard_error(each) ** 2 for each in experiments]
+    errors = [standard_error(each) ** 2 for each in experiments]
     assert np.mean(errors) == pytest.approx(experiments.mean((1, 2, 3)).var(), rel=0.05)
 
 
 def test_interval_for_every_point_of_a_curve():
     scores = np.random.default_rng(1).normal(size=(3, 5, 4, 2))
-    each = np.stack([evaluate.interval(point) for point in scores], axis=-1)
-    assert np.array_equal(evaluate.interval(scores), each)
+    each = np.stack([interval(point) for point in scores], axis=-1)
+    assert np.array_equal(interval(scores), each)
     assert each.shape == (2, 3)
 
 
 def test_one_seed_has_no_interval():
-    assert evaluate.interval(np.zeros((1, 50, 3))) is None
-    summary = evaluate.summary("gru", {"a": 64}, {"return": np.array([[[0.0, 2.0], [2.0, 2.0]]])})
-    assert summary["metrics"]["return"]["interval"] is None
+    assert interval(np.zeros((1, 50, 3))) is None
+    agent = summary("gru", {"a": 64}, {"return": np.array([[[0.0, 2.0], [2.0, 2.0]]])})
+    assert agent["metrics"]["return"]["interval"] is None
     told = "| return | gru | 1 | 1.500 | 2.000 | none: one seed | 1.500 | none: one seed |"
-    assert evaluate.table([summary]).splitlines()[-1] == told
+    assert table([agent]).splitlines()[-1] == told
 
 
 def test_iqm_of_episodes_and_of_level_means():
     """Ten levels, ten episodes each, seven of them won: 0.9 of the middle half, and each level's mean is 0.7."""
     won = np.tile([1.0] * 7 + [0.0] * 3, (2, 10, 1))
-    told = evaluate.summary("gru", {"a": 64, "b": 64}, {"success": won})["metrics"]["success"]
+    told = summary("gru", {"a": 64, "b": 64}, {"success": won})["metrics"]["success"]
     assert (told["mean"], told["iqm"], told["iqm_of_levels"]) == pytest.approx((0.7, 0.9, 0.7))
     assert told["interval"] == pytest.approx([0.9, 0.9])
     assert told["interval_of_levels"] == pytest.approx([0.7, 0.7])
@@ -110,18 +115,16 @@ def test_iqm_of_episodes_and_of_level_means():
 
 def test_seeds_at_different_steps_are_named():
     scores = {"return": np.zeros((3, 1, 1))}
-    same, other = (
-        evaluate.summary("gru", dict.fromkeys("abc", 64) | more, scores) for more in ({}, {"b": 32, "c": None})
-    )
-    assert "steps" not in evaluate.table([same])
+    same, other = (summary("gru", dict.fromkeys("abc", 64) | more, scores) for more in ({}, {"b": 32, "c": None}))
+    assert "steps" not in table([same])
     told = "gru: its seeds were trained for different numbers of steps: 64, 32, an unknown number"
-    assert evaluate.table([same, other]).splitlines()[-1] == told
+    assert table([same, other]).splitlines()[-1] == told
 
 
 def test_the_interval_is_that_of_all_resamples():
     scores = np.random.default_rng(3).random((4, 10, 3))
-    drawn = np.random.default_rng(0).integers(4, size=(evaluate.RESAMPLES, 4))
-    assert evaluate.interval(scores) == pytest.approx(np.percentile(evaluate.iqm(scores[drawn]), [2.5, 97.5]))
+    drawn = np.random.default_rng(0).integers(4, size=(RESAMPLES, 4))
+    assert interval(scores) == pytest.approx(np.percentile(iqm(scores[drawn]), [2.5, 97.5]))
 
 
 # ---- agents ----
@@ -137,7 +140,7 @@ def test_seeds_of_an_agent_are_found():
         "d": arguments("ppo_trxl", trxl_dim=32),
         "e": arguments("ppo_trxl", trxl_dim=32, seed=5),
     }
-    assert evaluate.agents_of(runs) == {
+    assert agents_of(runs) == {
         "ppo_gru memory=gru": ["a", "c"],
         "ppo_gru memory=none": ["b"],
         "ppo_trxl": ["d", "e"],
@@ -146,22 +149,22 @@ def test_seeds_of_an_agent_are_found():
 
 def test_own_names_of_agents():
     runs = {"a": arguments(exp_name="mine", gamma=0.9), "b": arguments(exp_name="yours", gamma=0.5)}
-    assert set(evaluate.agents_of(runs)) == {"mine", "yours"}
+    assert set(agents_of(runs)) == {"mine", "yours"}
     runs = {"a": arguments(exp_name="mine"), "b": arguments("ppo_trxl", exp_name="mine")}
-    assert set(evaluate.agents_of(runs)) == {"ppo_gru", "ppo_trxl"}
+    assert set(agents_of(runs)) == {"ppo_gru", "ppo_trxl"}
     runs = {"a": arguments(gamma=0.9), "b": arguments(gamma=0.5, exp_name="new"), "c": arguments(gamma=0.5)}
-    assert set(evaluate.agents_of(runs)) == {"ppo_gru gamma=0.9", "new gamma=0.5", "ppo_gru gamma=0.5"}
+    assert set(agents_of(runs)) == {"ppo_gru gamma=0.9", "new gamma=0.5", "ppo_gru gamma=0.5"}
 
 
 def test_an_argument_that_only_one_has_names_it():
     """As of runs of a script from before and after a flag was added."""
     runs = {"a": arguments("ppo_mine"), "b": arguments("ppo_mine", width=3)}
-    assert evaluate.agents_of(runs) == {"ppo_mine": ["a"], "width=3": ["b"]}
+    assert agents_of(runs) == {"ppo_mine": ["a"], "width=3": ["b"]}
 
 
 def test_the_same_seed_twice_is_refused():
     with pytest.raises(ValueError, match="b is the same agent and seed, 1, as a; leave one of them out"):
-        evaluate.agents_of({"a": arguments(), "b": arguments(cuda=False)})
+        agents_of({"a": arguments(), "b": arguments(cuda=False)})
 
 
 def test_the_same_seed_at_different_steps_is_told_apart():
@@ -171,26 +174,26 @@ def test_the_same_seed_at_different_steps_is_told_apart():
         "other": arguments(step=1000, gamma=0.9, seed=2),
         "gamma": arguments(step=300, gamma=0.5),
     }
-    assert evaluate.agents_of(runs) == {
+    assert agents_of(runs) == {
         "gamma=0.9 step=200": ["model-200"],
         "gamma=0.9 step=1000": ["model-1000", "other"],
         "gamma=0.5": ["gamma"],
     }
     del runs["gamma"]
-    assert list(evaluate.agents_of(runs)) == ["step=200", "step=1000"]
+    assert list(agents_of(runs)) == ["step=200", "step=1000"]
     runs["old"] = arguments(gamma=0.9)
-    assert list(evaluate.agents_of(runs)) == ["step=200", "step=1000", "step=unknown"]
+    assert list(agents_of(runs)) == ["step=200", "step=1000", "step=unknown"]
 
 
 def test_seeds_at_different_steps_are_one_agent():
     runs = {"a": arguments(step=100), "b": arguments(step=200, seed=2), "old": arguments(seed=3)}
-    assert evaluate.agents_of(runs) == {"ppo_gru": ["a", "b", "old"]}
+    assert agents_of(runs) == {"ppo_gru": ["a", "b", "old"]}
 
 
 def test_the_same_step_twice_is_refused():
     runs = {"a": arguments(step=100), "b": arguments(step=200), "c": arguments(step=200, resume="runs/x")}
     with pytest.raises(ValueError, match="c is the same agent and seed, 1, as b; leave one of them out"):
-        evaluate.agents_of(runs)
+        agents_of(runs)
 
 
 @pytest.mark.parametrize(
@@ -212,14 +215,14 @@ def test_the_same_step_twice_is_refused():
 )
 def test_how_a_run_was_kept_makes_no_other_agent(name):
     runs = {"a": arguments(**{name: "1"}), "b": arguments(seed=2, **{name: "2"})}
-    assert evaluate.agents_of(runs) == {"ppo_gru": ["a", "b"]}
+    assert agents_of(runs) == {"ppo_gru": ["a", "b"]}
 
 
 def test_other_tasks_are_apart():
     other = arguments(env_options='{"show_goal": [true]}')
     spelled = arguments(env_options='{ "show_goal":[true] }', seed=2)
     runs = {"a": arguments(), "b": other, "c": arguments(seed=2), "d": spelled}
-    assert evaluate.tasks_of(runs, evaluate.task_of) == {
+    assert tasks_of(runs, task_of) == {
         "MysteryPath-v0": {"ppo_gru": ["a", "c"]},
         'MysteryPath-v0 {"show_goal": [true]}': {"ppo_gru": ["b", "d"]},
     }
@@ -228,7 +231,7 @@ def test_other_tasks_are_apart():
         "b": arguments(env_id="Maze-v0", env_kwargs='{"size":9}', seed=2),
         "c": arguments(env_id="Maze-v0", env_kwargs='{"size": 17}'),
     }
-    assert evaluate.tasks_of(runs, evaluate.task_of) == {
+    assert tasks_of(runs, task_of) == {
         'Maze-v0 {"size": 9}': {"ppo_gru": ["a", "b"]},
         'Maze-v0 {"size": 17}': {"ppo_gru": ["c"]},
     }
@@ -237,7 +240,7 @@ def test_other_tasks_are_apart():
 @pytest.mark.parametrize("env_id", memory_gym_envs.IDS)
 def test_own_metric_is_told_by_the_environment(env_id):
     """6.1.3; every evaluation reports the return."""
-    metric = evaluate.own_metric(env_id)
+    metric = own_metric(env_id)
     envs = gym.make_vec(env_id, num_envs=1)
     envs.reset(seed=0)
     assert metric in envs.summary(np.array([0])) or (metric, env_id) == ("return", "Endless-MysteryPath-v0")
@@ -245,7 +248,7 @@ def test_own_metric_is_told_by_the_environment(env_id):
 
 # ---- curves ----
 def test_curves_on_common_steps():
-    steps, scores = evaluate.align(
+    steps, scores = align(
         [
             (np.array([0, 10, 20]), np.array([[[0.0, 5.0]], [[1.0, 5.0]], [[3.0, 5.0]]])),
             (np.array([5, 15]), np.array([[[4.0, 0.0]], [[8.0, 2.0]]])),
@@ -259,16 +262,16 @@ def test_curves_on_common_steps():
 
 def test_means_are_interpolated():
     runs = [(np.array([0, 10, 20]), np.array([0.0, 1.0, 3.0])), (np.array([5, 15]), np.array([4.0, 8.0]))]
-    steps, scores = evaluate.align([(x, values[:, None, None]) for x, values in runs])
+    steps, scores = align([(x, values[:, None, None]) for x, values in runs])
     assert steps.tolist() == [5, 10, 15]
     assert scores[..., 0, 0].tolist() == [[0.5, 4], [1, 6], [2, 8]]
 
 
 def test_dense_evaluations_are_left_out():
-    steps = np.arange(1, 10 * evaluate.POINTS + 1)
+    steps = np.arange(1, 10 * POINTS + 1)
     won = np.random.default_rng(1).integers(2, size=(len(steps), 2, 3))
-    common, scores = evaluate.align([(steps, won)])
-    assert np.array_equal(common, np.arange(10, 10 * evaluate.POINTS + 1, 10))
+    common, scores = align([(steps, won)])
+    assert np.array_equal(common, np.arange(10, 10 * POINTS + 1, 10))
     assert np.array_equal(scores[:, 0], won[9::10])
 
 
@@ -278,20 +281,20 @@ def test_curves_of_different_levels_or_episodes_are_compared_by_their_means(shap
         (np.array([1, 2]), np.array([0.0, 4.0, 2.0, 4.0]).reshape(shape)),
         (np.array([1, 2]), np.array([[[1.0]], [[5.0]]])),
     ]
-    assert evaluate.align(runs)[1][..., 0, 0].tolist() == [[2, 1], [3, 5]]
+    assert align(runs)[1][..., 0, 0].tolist() == [[2, 1], [3, 5]]
 
 
 def test_dense_curves_are_averaged():
-    steps = np.arange(1, 10 * evaluate.POINTS + 1)
-    common, scores = evaluate.align([(steps, steps[:, None, None] * 2.0)])
-    assert len(common) == evaluate.POINTS
+    steps = np.arange(1, 10 * POINTS + 1)
+    common, scores = align([(steps, steps[:, None, None] * 2.0)])
+    assert len(common) == POINTS
     assert common[0] == 5.5  # of 1 to 10
     assert np.array_equal(scores[:, 0, 0, 0], common * 2)
 
 
 def test_curves_without_common_steps():
     with pytest.raises(ValueError, match="do not overlap; leave out the shortest run"):
-        evaluate.align([(np.array([1, 2]), np.zeros((2, 1, 1))), (np.array([3]), np.zeros((1, 1, 1)))])
+        align([(np.array([1, 2]), np.zeros((2, 1, 1))), (np.array([3]), np.zeros((1, 1, 1)))])
 
 
 @pytest.fixture(scope="module")
@@ -328,9 +331,9 @@ def test_curves_drawn(agents, scalars, capsys):
 
 
 def test_a_curve_is_the_iqm_with_its_band(agents, scalars):
-    runs = {"gru": [evaluate.read_run(folder) for folder in agents[:2]], "trxl": [evaluate.read_run(agents[2])]}
+    runs = {"gru": [read_run(folder) for folder in agents[:2]], "trxl": [read_run(agents[2])]}
     axis = Figure().subplots()
-    evaluate.draw_metric(axis, "losses/entropy", runs, {"gru": {"color": "C0"}, "trxl": {"color": "C1"}})
+    draw_metric(axis, "losses/entropy", runs, {"gru": {"color": "C0"}, "trxl": {"color": "C1"}})
     curves = np.stack([scalars(folder)["losses/entropy"] for folder in agents])
     gru, trxl = axis.lines
     assert np.allclose(gru.get_ydata(), curves[:2].mean(0))  # a quarter of two seeds is none
@@ -347,13 +350,13 @@ def test_hyperparameters_are_those_of_the_run(agents):
         script = ppo_trxl if "trxl" in folder else ppo_gru
         args = saved_args(script.Args, read_model(f"{folder}/model.pt"))
         text = {name: str(value) for name, value in asdict(args).items()}
-        assert evaluate.read_run(folder).args == {"script": script.__name__} | text
+        assert read_run(folder).args == {"script": script.__name__} | text
 
 
 def test_evaluations_are_shown_before_training_episodes(agents):
-    runs = [evaluate.read_run(folder) for folder in agents]
-    assert evaluate.curve_name("length", runs) == "eval/length"
-    assert evaluate.curve_name("episode/length", runs[:1]) == "episode/length"
+    runs = [read_run(folder) for folder in agents]
+    assert curve_name("length", runs) == "eval/length"
+    assert curve_name("episode/length", runs[:1]) == "episode/length"
     assert runs[0].curves["eval/length"][1].shape == (2, 2, 3), "two evaluations, two levels, thrice each"
     assert runs[0].curves["episode/length"][1].shape == (2, 1, 1)
 
@@ -365,7 +368,7 @@ def test_the_arguments_of_an_older_run():
         writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
         writer.add_scalar("eval/return", float("nan"), 5)
         writer.add_scalar("eval/return", 2.0, 10)
-    run = evaluate.read_run("old")
+    run = read_run("old")
     defaults = {name: str(value) for name, value in asdict(ppo_gru.Args()).items()}
     changed = {"script": "ppo_gru", "seed": "3", "num_envs": "4", "env_id": "A-v0", "trunk_size": "7"}
     changed["value_init_gain"] = "1.0"  # which was no flag, and had this value
@@ -381,7 +384,7 @@ def test_the_levels_of_an_older_run():
         writer.add_scalar("eval/return", 2.5, 20)
         writer.add_tensor("eval_levels/return", torch.tensor([1.0, 3.0]), 10)
         writer.add_tensor("eval_levels/return", torch.tensor([[1.0, 2.0], [3.0, 4.0]]), 20)
-    steps, scores = evaluate.read_run("old").curves["eval/return"]
+    steps, scores = read_run("old").curves["eval/return"]
     assert (steps.tolist(), scores.tolist()) == ([10, 20], [[[1], [3]], [[1.5], [3.5]]])
 
 
@@ -401,9 +404,9 @@ def test_a_table_says_whose_episodes_were_not_kept(capsys):
             writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
             writer.add_scalar("eval/return", np.mean(scores), 10)
             writer.add_tensor("eval_levels/return", torch.tensor(scores), 10)
-    evaluate.draw_curves(evaluate.Config(curves=("run-2",)))
+    draw_curves(("run-2",))
     assert "earlier versions kept" not in capsys.readouterr().out
-    (task,) = evaluate.draw_curves(evaluate.Config(curves=("run-1", "run-2")))
+    (task,) = draw_curves(("run-1", "run-2"))
     assert task["agents"][0]["metrics"]["eval/return"]["scores"] == [[[1], [3]], [[1.5], [3.5]]]
     assert "earlier versions kept the levels' means only" in capsys.readouterr().out
 
@@ -412,7 +415,7 @@ def test_the_arguments_of_a_run_of_another_script():
     with SummaryWriter("other") as writer:
         writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|script|ppo_other|\n|seed|3|")
         writer.add_scalar("eval/return", 2.0, 10)
-    assert evaluate.read_run("other").args == {"script": "ppo_other", "seed": "3"}
+    assert read_run("other").args == {"script": "ppo_other", "seed": "3"}
 
 
 def test_a_model_of_another_script():
@@ -456,7 +459,7 @@ def write_old_events(folder, seed):
 
 
 def test_hours_of_training():
-    run = evaluate.read_run(write_events("a", 1, [(900, 900), (2700, 900), (0, 1800)]))
+    run = read_run(write_events("a", 1, [(900, 900), (2700, 900), (0, 1800)]))
     assert run.hours(np.array([50, 100, 150, 200, 300])).tolist() == [0.25, 0.5, 1, 1.5, 2]
 
 
@@ -473,12 +476,12 @@ def test_a_resumed_run_counts_its_seconds_once(caplog, clock):
     (second,) = {*Path("a").iterdir()} - {Path(f"a/events.out.tfevents.{clock}")}
     second.rename("a/events.out.tfevents.8888888888")
     write_events("a", 1, [(3, 1), (4, 1), (5, 1)], begin=200, purge_step=201, num_steps=128)
-    run = evaluate.read_run("a")
+    run = read_run("a")
     steps, _ = run.curves["charts/seconds_iteration"]
     assert (steps.tolist(), run.seconds("iteration").tolist()) == ([100, 200, 300, 400, 500], [2, 3, 4, 5, 6])
     assert run.hours(np.array([500]))[0] == pytest.approx(20 / 3600)
     assert run.curves["charts/episodic_return"][0].tolist() == [100, 200, 300, 400, 500]
-    assert evaluate.wall_time([run])["hours"] == pytest.approx(20 / 3600)
+    assert wall_time([run])["hours"] == pytest.approx(20 / 3600)
     assert run.args["num_steps"] == "128", "those that it was resumed with"
     assert not caplog.records, "TensorBoard calls it a crash"
 
@@ -495,18 +498,18 @@ def test_a_resumed_run_forgets_the_evaluations_beyond_its_checkpoint():
     (second,) = Path("b").iterdir()
     second.rename("a/events.out.tfevents.1")
     write_events("a", 1, [], purge_step=201)
-    run = evaluate.read_run("a")
+    run = read_run("a")
     steps, scores = run.curves["eval/return"]
     assert (steps.tolist(), scores.tolist()) == ([200], [[[200.0] * 3] * 2])
     assert run.last_step == 200
 
 
 def test_curves_over_time_are_aligned_in_hours():
-    fast = evaluate.read_run(write_events("a", 1, [(1800, 1800)] * 3))  # 1, 2 and 3 hours
-    slow = evaluate.read_run(write_events("b", 2, [(3600, 3600)] * 3))  # 2, 4 and 6 hours
+    fast = read_run(write_events("a", 1, [(1800, 1800)] * 3))  # 1, 2 and 3 hours
+    slow = read_run(write_events("b", 2, [(3600, 3600)] * 3))  # 2, 4 and 6 hours
     axis = Figure().subplots()
     styles = {"gru": {"color": "C0"}}
-    last = evaluate.draw_metric(axis, "charts/episodic_return", {"gru": [fast, slow]}, styles, "time")
+    last = draw_metric(axis, "charts/episodic_return", {"gru": [fast, slow]}, styles, "time")
     (line,) = axis.lines
     assert line.get_xdata().tolist() == [2, 3], "as far as both reach"
     assert line.get_ydata().tolist() == [1.5, 2.25]
@@ -549,11 +552,11 @@ def test_wall_times(capsys):
 
 def test_wall_times_are_left_out_where_runs_have_none(capsys):
     new, old = write_events("a", 1, [(1, 1), (1, 1)]), write_old_events("b", 2)
-    (task,) = evaluate.draw_curves(evaluate.Config(curves=(new, old)))
+    (task,) = draw_curves((new, old))
     assert "wall_time" not in task["agents"][0]
     assert "seconds of an iteration" not in capsys.readouterr().out
     other = write_events("c", 1, [(1, 1), (1, 1)], gamma=0.5)
-    (task,) = evaluate.draw_curves(evaluate.Config(curves=(new, old, other)))
+    (task,) = draw_curves((new, old, other))
     assert ["wall_time" in agent for agent in task["agents"]] == [False, True]
     assert "| gamma=0.5 | 1 | 2.000 |" in capsys.readouterr().out.split("hours of a training")[1]
 
@@ -562,7 +565,7 @@ def test_three_tasks_are_drawn_two_by_two():
     runs = tuple(
         write_events(f"run-{env_id}", 1, [(1, 1), (1, 1)], env_id=env_id) for env_id in ("A-v0", "B-v0", "C-v0")
     )
-    report = evaluate.draw_curves(evaluate.Config(curves=runs))
+    report = draw_curves(runs)
     assert [task["task"] for task in report] == ["A-v0", "B-v0", "C-v0"]
     width, height = Image.open("curves.png").size
     assert 1.3 < width / height < 1.5  # four pictures of 5.5 by 4 inches
@@ -572,11 +575,11 @@ def test_three_tasks_are_drawn_two_by_two():
 
 def test_an_agent_has_one_look_in_all_tasks_and_one_place_in_the_legend(monkeypatch):
     figures = []
-    monkeypatch.setattr(evaluate.Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
-    run = evaluate.read_run(write_events("a", 1, [(1, 1), (1, 1)]))
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    run = read_run(write_events("a", 1, [(1, 1), (1, 1)]))
     others = {f"task {i}": {f"agent {i}": [run]} for i in range(9)}
     tasks = {"first": {"gru": [run, run]}, "second": {"trxl": [run], "gru": [run]}} | others
-    last = evaluate.draw_tasks(tasks, "curves", dict.fromkeys(tasks, ("return",)))
+    last = draw_tasks(tasks, "curves", dict.fromkeys(tasks, ("return",)))
     assert [*last["first"]] == ["gru"]
     figure = figures[0]
     first, second, *_, ninth = figure.axes
@@ -714,18 +717,18 @@ def test_a_result_has_what_tables_need():
     """The family's metric, return, length and falls, by episode, and the seconds."""
     with SummaryWriter("run") as writer:
         writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|1|\n|env_id|MysteryPath-v0|")
-        for name in evaluate.SECONDS.values():
+        for name in SECONDS.values():
             writer.add_scalar(name, 1.0, 10)
         for name in ("success", "return", "length", "num_fails", "other"):
             writer.add_scalar(f"eval/{name}", 1.5, 10)
             writer.add_tensor(f"eval_levels/{name}", torch.tensor([[1.0, 2.0]]), 10)
-    evaluate.write_run(evaluate.read_run("run"), "run.json.gz")
-    kept = evaluate.read_run("run.json.gz").curves
+    write_run(read_run("run"), "run.json.gz")
+    kept = read_run("run.json.gz").curves
     assert {name for name in kept if "eval" in name} == {
         "eval/success", "eval/return", "eval/length", "eval/num_fails"
     }  # fmt: skip
     assert kept["eval/num_fails"][1].tolist() == [[[1.0, 2.0]]]
-    assert kept.keys() >= {*evaluate.SECONDS.values()}
+    assert kept.keys() >= {*SECONDS.values()}
 
 
 def test_episodes_cut_short(agents, capsys):

@@ -24,7 +24,9 @@ import evaluate
 import learning
 import ppo_gru
 import tables
+from ppo_utils.run_logs import SECONDS, RunLog, with_defaults
 from ppo_utils.runs import run_to_end
+from ppo_utils.scores import iqm
 from suites import short
 
 ROOT = Path(__file__).parents[1]
@@ -163,7 +165,7 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     assert (kept.machine, whole.machine) == (learning.machine(), "not recorded")
     assert f" {os.cpu_count()} cores, PyTorch {torch.__version__}" in kept.machine
     scores = ("eval/commands_completed", "eval/return", "eval/length")
-    for name in (*scores, "charts/seconds_iteration", *evaluate.UPDATE_CURVES):
+    for name in (*scores, "charts/seconds_iteration", *learning.UPDATE_CURVES):
         for one, other in zip(kept.curves[name], whole.curves[name], strict=True):
             assert one == pytest.approx(other, rel=1e-3)
     assert kept.curves["eval/return"][1].shape == (3, 2, 3)
@@ -180,7 +182,7 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     told = capsys.readouterr().out
     assert "trained" not in told
     score = tested.mean()
-    assert f"\n| {short(agent)} | {score:.2f} | {evaluate.iqm(tested):.2f} | {score:.2f} |" in told
+    assert f"\n| {short(agent)} | {score:.2f} | {iqm(tested):.2f} | {score:.2f} |" in told
     assert f"\nRuns: 1, together 0.0 hours without evaluations. Machines: {kept.machine}\n" in told
     assert config.out.stat().st_size > 10_000
 
@@ -228,9 +230,9 @@ def test_a_training_that_is_about_to_begin_is_stopped_too(tmp_path, monkeypatch)
 )
 def test_a_run_is_complete_when_no_iteration_is_left(total, last, complete, tmp_path):
     """Of 32 steps each; and when it has written its final weights: it may have been stopped, resumed and killed."""
-    seconds = {name: (np.array([last]), np.ones((1, 1, 1))) for name in evaluate.SECONDS.values()}
+    seconds = {name: (np.array([last]), np.ones((1, 1, 1))) for name in SECONDS.values()}
     args = {"total_timesteps": str(total), "num_envs": "4", "num_steps": "8"}
-    run = evaluate.RunLog(str(tmp_path), args, seconds)
+    run = RunLog(str(tmp_path), args, seconds)
     assert not learning.is_complete(run)
     write_model(tmp_path, last - 32)
     assert not learning.is_complete(run)
@@ -250,7 +252,7 @@ def test_final_weights_are_scored_as_their_evaluations_are(tmp_path, monkeypatch
     monkeypatch.setattr(subprocess, "run", lambda line, **how: (lines.append(" ".join(line)), done)[1])
     config = learning.Config(folder=tmp_path)
     plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU --eval-max-steps 123", 1)
-    run = evaluate.RunLog(str(tmp_path), {}, {name: (np.array([96]), np.ones(1)) for name in evaluate.SECONDS.values()})
+    run = RunLog(str(tmp_path), {}, {name: (np.array([96]), np.ones(1)) for name in SECONDS.values()})
     assert learning.test_scores(config, plan, run) == {"test/return": ([96], 1.0)}
     assert "--max-steps 123" in lines[0]
 
@@ -261,13 +263,13 @@ def test_a_run_without_a_score_at_its_end_is_no_result(last, tested, tmp_path, m
     config = learning.Config(folder=tmp_path, results=tmp_path / "results")
     plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", 1)
     end = plan.args.total_timesteps // 4096 * 4096
-    curves = {name: (np.array([end]), np.ones((1, 1, 1))) for name in evaluate.SECONDS.values()}
+    curves = {name: (np.array([end]), np.ones((1, 1, 1))) for name in SECONDS.values()}
     if last is not None:
         curves["eval/commands_completed"] = np.array([end if last == "end" else last]), np.ones((1, 1, 1))
     folder = tmp_path / "run"
     folder.mkdir()
     write_model(folder, end)
-    run = evaluate.RunLog(str(folder), plan.logged_args(), curves)
+    run = RunLog(str(folder), plan.logged_args(), curves)
     monkeypatch.setattr(learning, "runs_in", lambda place, plan: [run])
     test = {"test/commands_completed": ([end], np.ones((1, 5, 1)))} if tested else {}
     monkeypatch.setattr(learning, "test_scores", lambda *_: test)
@@ -310,11 +312,11 @@ def test_a_log_tells_how_far_its_training_is(tmp_path):
 def test_results_as_one_table(tmp_path, capsys):
     args = {"env_id": "X-v0", "env_options": "{}", "exp_name": "GRU", "script": "ppo_gru", "seed": "3"}
     scores = np.broadcast_to(np.reshape([1, 2, 3], (3, 1, 1)), (3, 4, 2))
-    run = evaluate.RunLog("", args, {"eval/return": (np.array([100, 200, 300]), scores)})
-    seconds = {name: (np.array([100, 200, 300]), np.full((3, 1, 1), 36.0)) for name in evaluate.SECONDS.values()}
+    run = RunLog("", args, {"eval/return": (np.array([100, 200, 300]), scores)})
+    seconds = {name: (np.array([100, 200, 300]), np.full((3, 1, 1), 36.0)) for name in SECONDS.values()}
     test = {"test/return": ([300], np.full((1, 7, 1), 2.5))}
     (tmp_path / "X-v0").mkdir()
-    evaluate.write_run(replace(run, curves=run.curves | seconds | test), f"{tmp_path}/X-v0/run.json.gz")
+    learning.write_run(replace(run, curves=run.curves | seconds | test), f"{tmp_path}/X-v0/run.json.gz")
     learning.main(learning.Config(results=tmp_path, csv=tmp_path / "all.csv"))
     assert capsys.readouterr().out == f"{tmp_path}/all.csv: the scores of 1 runs\n"
     assert (tmp_path / "all.csv").read_text().splitlines() == [
@@ -330,10 +332,10 @@ def test_hours_of_trainings_are_expected_by_those_that_are_there(tmp_path):
     config = learning.Config(results=tmp_path, jobs=2)
     plans = [learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", seed) for seed in (1, 2)]
     assert learning.expected_hours(config, plans) == ""
-    curves = {name: (np.array([7200]), np.full((1, 1, 1), 36.0)) for name in evaluate.SECONDS.values()}
-    run = evaluate.RunLog("", plans[0].logged_args(), curves)  # 200 steps a second
+    curves = {name: (np.array([7200]), np.full((1, 1, 1), 36.0)) for name in SECONDS.values()}
+    run = RunLog("", plans[0].logged_args(), curves)  # 200 steps a second
     (tmp_path / "X-v0").mkdir()
-    evaluate.write_run(run, f"{tmp_path}/X-v0/run.json.gz")
+    learning.write_run(run, f"{tmp_path}/X-v0/run.json.gz")
     assert learning.expected_hours(config, plans) == ", about 1.4 hours"  # two million steps, two at a time
 
 
@@ -388,7 +390,7 @@ def test_a_run_goes_on_only_from_a_checkpoint(tmp_path, monkeypatch):
     plan = replace(plan, command=(sys.executable, str(script), "--seed", "1"))
     run = tmp_path / "runs/a"
     run.mkdir(parents=True)
-    monkeypatch.setattr(learning, "runs_in", lambda place, plan: [evaluate.RunLog(str(run), {}, {})])
+    monkeypatch.setattr(learning, "runs_in", lambda place, plan: [RunLog(str(run), {}, {})])
     learning.train(config, plan)
     (run / "checkpoint-64.pt").touch()
     learning.train(config, plan)
@@ -412,4 +414,4 @@ def test_the_first_values_are_those_of_the_results(agent):
     assert plan.args.value_init_gain == (0.01 if "0.01" in agent else 1.0)
     older = {name: text for name, text in plan.logged_args().items() if name != "value_init_gain"}
     if "0.01" not in agent:
-        assert evaluate.with_defaults(older) == plan.logged_args()
+        assert with_defaults(older) == plan.logged_args()

@@ -29,6 +29,7 @@ import ppo_trxl
 from ppo_utils import checkpoints, runs
 from ppo_utils.checkpoints import model_of, read_checkpoint, read_model, write_file
 from ppo_utils.errors import RunError
+from ppo_utils.run_logs import read_run
 
 GRID = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector"}
 ENDLESS = {"env_id": "Endless-SearingSpotlights-v0", "obs_type": "vector"}
@@ -158,7 +159,7 @@ def test_what_was_played_twice_is_logged_once(tiny, curves, monkeypatch, script)
     assert curves(run.folder)["losses/loss"] == whole["losses/loss"][:3]
     assert resumed(script, run.folder) == run.folder
     assert curves(run.folder) == whole
-    steps, scores = evaluate.read_run(str(run.folder)).curves["eval/return"]
+    steps, scores = read_run(str(run.folder)).curves["eval/return"]
     assert steps.tolist() == [64, 128, 192, 256, 320, 384]
     assert scores.shape == (6, 2, 3), "each level's"
 

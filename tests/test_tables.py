@@ -14,6 +14,7 @@ import evaluate
 import learning
 import tables
 import tuning
+from ppo_utils.run_logs import RunLog
 from suites import AGENTS, COLORS, SUITES, TASKS, short
 
 ROOT = Path(__file__).parents[1]
@@ -24,7 +25,7 @@ def run_with(*means, metric="eval/coins_collected"):
     steps = np.array([100, 200, 300])
     scores = np.broadcast_to(np.reshape(means, (3, 1, 1)), (3, 4, 2))
     curves = {metric: (steps, scores), "charts/seconds_iteration": (steps, np.full((3, 1, 1), 60.0))}
-    return evaluate.RunLog("", {"total_timesteps": "300"}, curves, "a laptop")
+    return RunLog("", {"total_timesteps": "300"}, curves, "a laptop")
 
 
 def test_a_row_of_the_table():
@@ -258,7 +259,7 @@ def test_a_speed_is_that_of_the_whole_training_on_one_core(tmp_path, monkeypatch
 
     speeds = {"charts/SPS": (np.array([128, 256]), np.reshape([10.0, 20.4], (2, 1, 1)))}
     monkeypatch.setattr(tuning.subprocess, "run", run)
-    monkeypatch.setattr(evaluate, "read_run", lambda path: evaluate.RunLog(path, {}, speeds))
+    monkeypatch.setattr(evaluate, "read_run", lambda path: RunLog(path, {}, speeds))
     asked, measure = [], tuning.measure_speeds
     monkeypatch.setattr(tuning, "measure_speeds", lambda tasks: (asked.append(tasks), measure(tasks)))
     monkeypatch.setattr(tuning, "table", lambda speeds: "")
