@@ -91,7 +91,9 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     `ground_truth` (2,): the target tile's column and row, divided by arena size - 1. At an episode's end also `reward`,
     `length`, `commands_completed` and `success` (in the endless id `max_command_sequence`, the length of the longest
-    completed sequence). commands_completed is a share of the sequence, in the endless id a number of commands.
+    completed sequence). commands_completed is a share of the sequence, in the endless id a number of commands. The
+    finite ids add `carried_out`, the share of commands whose tile the agent was on when all others caught fire, which a
+    failed last command does not raise.
 
     ## Arguments
 
@@ -288,7 +290,8 @@ class MortarMayhem(MemoryGymVectorEnv):
         success = s.current[lanes] >= s.count[lanes]
         failed = s.burning[lanes] & ~on_target(s, lanes) & ~success
         share = (s.current[lanes] - failed) / s.count[lanes]
-        return numbers | {"success": success.astype(np.int64), "commands_completed": share}
+        numbers |= {"success": success.astype(np.int64), "commands_completed": share}
+        return numbers | {"carried_out": s.completed[lanes] / s.count[lanes]}
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Circles the lane's target tile in its magnified frame, in place."""

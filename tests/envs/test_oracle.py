@@ -84,6 +84,7 @@ def test_failure_pays_only_the_failure_reward(env_id):
         assert sum(rewards) == info["reward"] == done - 0.5
         # A failure at the very last command counts as success, as in the original.
         assert info["commands_completed"] == (1.0 if done == 4 else done / 5)
+        assert info["carried_out"] == done / 5
         assert info["success"] == (done == 4)
 
 
@@ -97,6 +98,7 @@ def test_failing_at_the_last_command(env_id):
     for seed in range(20):
         rewards, _, _, info = play_out(env, lambda: idle, seed, options)
         assert (info["success"], info["commands_completed"]) == (1, 1.0)
+        assert info["carried_out"] == (rewards[-1] == 3.1)
         assert not any(rewards[:-1])
         earned.add(rewards[-1])
     assert earned == {-0.5, 3.1}  # 3.1 where the command was to stay
@@ -115,6 +117,7 @@ def test_commands_completed_before_a_time_limit(env_id):
         assert not terminated.any()
         final = infos["final_info"]
         assert final["commands_completed"] == pytest.approx(final["reward"])  # 0.1 for each of ten
+        assert np.array_equal(final["carried_out"], final["commands_completed"])
         found |= {*final["commands_completed"].round(1).tolist()}
     assert found == {i / 10 for i in range(10)}
 
