@@ -429,7 +429,7 @@ def outcome(episode: Episode, env_id: str) -> dict[str, Any]:
     """Return what the page's head tells of the episode's end."""
     steps = len(episode.actions)
     facts = {"steps": steps, "return": f"{sum(episode.rewards):.4g}"}
-    shares = {"agent_health"} | ({"commands_completed", "coins_collected"} if "Endless" not in env_id else set())
+    shares = {"agent_health"} | ({"carried_out", "coins_collected"} if "Endless" not in env_id else set())
     for name, value in episode.final.items():
         if name not in ("reward", "length"):
             is_share = name in shares and is_memory_gym(env_id)

@@ -34,7 +34,6 @@ import tyro
 from tqdm import tqdm
 
 from ppo_utils.checkpoints import import_script, load_weights, read_model, saved_args
-from ppo_utils.curves import draw_curves
 from ppo_utils.environments import envs_for, with_options
 from ppo_utils.errors import RunError
 from ppo_utils.evaluation import are_trained_on, evaluate, evaluation_levels, first_unseen, make_agent
@@ -216,6 +215,8 @@ def main(config: Config) -> None:
         if os.path.isdir(config.json):
             raise ValueError(f"--json {config.json} is a folder; give a file to write to")
     if config.curves:
+        from ppo_utils.curves import draw_curves  # it needs matplotlib; to play, nothing else has to be installed
+
         report = draw_curves(config.curves, config.out, config.metrics, config.over)
     else:
         report = score_checkpoints(config)

@@ -48,12 +48,12 @@ def play(
     envs = gym.make_vec(task.env_id, num_envs=levels, obs_type="vector", max_episode_steps=max_steps)
     envs.reset(seed=FIRST_TEST_LEVEL, options=task.options)
     rng, scores, playing = np.random.default_rng(0), np.zeros(levels), np.ones(levels, bool)
-    name = "reward" if task.best_return or task.metric == "return" else task.metric
+    name = "reward" if task.score == "return" else task.score
     while playing.any():
         *_, infos = envs.step(actions_of(envs, rng))
         if "final_info" in infos:
             ended = infos["_final_info"] & playing
-            scores[ended] = infos["final_info"][name][ended] / (task.best_return or 1.0)
+            scores[ended] = infos["final_info"][name][ended]
             playing &= ~ended
     return scores
 

@@ -1,7 +1,7 @@
 """Does memory matter, and which one? Trains agents on a suite of tasks, and tabulates what they reach.
 
     python benchmarks/learning.py --out docs/learning.png
-    python benchmarks/learning.py --tasks endless-mortar-mayhem --agents GRU TrXL "TrXL, gradient" --steps-scale 6
+    python benchmarks/learning.py --tasks endless-mortar-mayhem --agents GRU TrXL "TrXL, gradient" --steps 6e6
     python benchmarks/learning.py --suite full --results benchmarks/results
     python benchmarks/learning.py --results benchmarks/results --csv results.csv
 
@@ -48,7 +48,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of 
 import tables
 from ppo_utils.checkpoints import read_model
 from ppo_utils.evaluation import first_unseen
-from ppo_utils.flags import PositiveInt, bounded, check_args, check_bounds, check_minibatches
+from ppo_utils.flags import PositiveInt, check_args, check_bounds, check_minibatches
 from ppo_utils.run_logs import SECONDS, NoCurvesError, RunLog, Runs, align, read_run
 from ppo_utils.runs import parse_args
 from ppo_utils.scores import own_metric
@@ -66,8 +66,8 @@ UPDATE_CURVES = ("losses/grad_norm", "losses/entropy", "charts/gradient_steps", 
 class Training:
     """How agents are trained, and where that goes."""
 
-    steps_scale: bounded(float, 0, 1000, above=True) = 1.0
-    """share of a task's steps to train for"""
+    steps: PositiveInt | None = None
+    """environment steps to train for (default: the task's)"""
     seeds: tuple[int, ...] = (1, 2, 3)
     """a training run each"""
     jobs: PositiveInt = os.cpu_count() or 1
@@ -150,7 +150,7 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
 
     Raises SystemExit for flags that the script refuses, or that belong to the suite.
     """
-    steps = int(task.total_timesteps * config.steps_scale)
+    steps = config.steps or task.total_timesteps
     of_the_suite = {
         "env_id": task.env_id,
         "env_options": json.dumps(task.options),
@@ -176,7 +176,7 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
     if theirs != of_the_suite or parsed.seed != type(parsed).seed or args.eval_interval or args.resume:
         raise SystemExit(
             f"{agent}: an agent has no task, steps, name, seed or evaluations of its own, and goes on with no other "
-            "run; use --tasks, --steps-scale, --seeds and --evaluations"
+            "run; use --tasks, --steps, --seeds and --evaluations"
         )
     if not args.save_model:
         raise SystemExit(f"{agent}: --no-save-model leaves no weights to score")
@@ -202,14 +202,8 @@ def runs_in(place: str, plan: Plan) -> list[RunLog]:
 
 
 def result_of(config: Training, plan: Plan) -> RunLog | None:
-    """Return the finished run, if its result is there, with the curve `eval/{plan.task.score}`."""
-    run = next(iter(runs_in(f"{config.results}/{plan.task.env_id}", plan)), None)
-    if run is not None and plan.task.best_return is not None:
-        for levels in ("eval", "test"):
-            if f"{levels}/return" in run.curves:
-                steps, returns = run.curves[f"{levels}/return"]
-                run.curves[f"{levels}/{plan.task.score}"] = steps, returns / plan.task.best_return
-    return run
+    """Return the finished run, if its result is there."""
+    return next(iter(runs_in(f"{config.results}/{plan.task.env_id}", plan)), None)
 
 
 def has_all_steps(run: RunLog) -> bool:
@@ -304,7 +298,7 @@ def write_result(config: Training, plan: Plan) -> None:
     run = next(filter(is_complete, runs_in(folder, plan)), None)
     if run is None:
         raise SystemExit(f"{plan}, was stopped; the same command goes on with it")
-    metric = plan.task.metric
+    metric = plan.task.score
     curves = run.curves | test_scores(config, plan, run)
     ends = [curves.get(f"{levels}/{metric}", ([0], None))[0][-1] for levels in ("eval", "test")]
     if ends != [run.last_step] * 2:

@@ -64,28 +64,14 @@ class Task:
         return f"{self.env_id} {json.dumps(self.options)}" if self.options else self.env_id
 
     @property
-    def metric(self) -> str:
-        """Return the name of the family's own metric (6.1.3)."""
-        return own_metric(self.env_id)
-
-    @property
-    def best_return(self) -> float | None:
-        """Return what all commands of a finite Mortar Mayhem pay, None for other tasks."""
-        return 0.1 * self.options.get("command_count", [10])[0] if self.env_id.startswith("MortarMayhem") else None
-
-    @property
     def best_score(self) -> float | None:
         """Return the best score that is possible, None where there is no bound."""
         return 1.0 if self.score in ("carried_out", "success") else None
 
     @property
     def score(self) -> str:
-        """Return the name of the score by which agents are compared: the metric, or what they carried out.
-
-        That is a finite Mortar Mayhem's share of the commands by the return (`result_of`). Its metric, as the
-        original's, counts a last command as completed even if it failed.
-        """
-        return self.metric if self.best_return is None else "carried_out"
+        """Return the name of the score by which agents are compared: the family's own metric (6.1.3)."""
+        return own_metric(self.env_id)
 
 
 SMALL = {

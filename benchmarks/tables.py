@@ -147,9 +147,8 @@ def table(task: Task, agents: Runs) -> str:
     every_run = [run for runs in runs_of.values() for run in runs]
     hours = sum(run.seconds("iteration").sum() for run in every_run) / 3600
     machines = "; ".join(dict.fromkeys(run.machine for run in every_run))
-    metric = () if task.score == task.metric else (task.metric,)
     taken = ("ahead of", "largest drop", "minutes to 0.5 of the best", "minutes to 0.9", "minutes")
-    header = ("agent", "mean", "IQM", "each seed", *metric, *taken)
+    header = ("agent", "mean", "IQM", "each seed", *taken)
     lines = [
         f"{task.score} after {int(every_run[0].args['total_timesteps']):,} steps\n",
         f"| {' | '.join(header)} |",
@@ -167,7 +166,7 @@ def row(agent: str, runs_of: Runs, task: Task, best: float) -> str:
     """Return the agent's row: its score, that of each seed, which agents it is ahead of, and how it learned.
 
     That is the largest drop, how far a seed's mean is below an earlier one, and the minutes to 0.5 and 0.9 of `best`,
-    all on development levels. If the task's score is not its metric, the mean of the metric stands behind the score.
+    all on development levels.
     """
     runs = runs_of[agent]
     scores = final_scores(task.score, runs)  # (R, M, E)
@@ -177,8 +176,6 @@ def row(agent: str, runs_of: Runs, task: Task, best: float) -> str:
     drop = (np.maximum.accumulate(means) - means).max()
     cells = [agent, mean_and_error(scores), f"{iqm(scores):.2f}"]
     cells.append(", ".join(f"{mean:.2f}" for mean in scores.mean((1, 2))))
-    if task.score != task.metric:
-        cells.append(f"{final_scores(task.metric, runs).mean():.2f}")
     cells.append(", ".join(other for other in runs_of if is_ahead(scores, final_scores(task.score, runs_of[other]))))
     cells.append(f"{drop:.2f}")
     for share in (0.5, 0.9):

@@ -11,15 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import color_sequences, rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, StrMethodFormatter
-from scipy.stats import trim_mean
 
 from ppo_utils.run_logs import SECONDS, RunLog, Runs, align, read_run
 from ppo_utils.scores import interval, iqm, own_metric, summary, table, task_of, tasks_of
+
+try:
+    from matplotlib import color_sequences, rc_context
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.ticker import EngFormatter, StrMethodFormatter
+except ImportError as error:
+    raise ImportError(f'to draw needs {error.name}: pip install -e ".[eval]"') from None
 
 LABEL_WIDTH = 48  # characters of a line in a legend; a longer one would leave no room for the curves
 
@@ -188,7 +191,7 @@ def wall_time(runs: list[RunLog]) -> dict[str, float]:
         "std": seconds.std(),
         "min": seconds.min(),
         "median": np.median(seconds),
-        "iqm": trim_mean(seconds, 0.25),
+        "iqm": iqm(seconds[None, None]),
         "max": seconds.max(),
         **parts,
         "hours": np.mean([each.sum() for each in durations]) / 3600,

@@ -15,6 +15,9 @@ from ppo_utils.errors import RunError
 from ppo_utils.flags import RunArgs
 from ppo_utils.lanes import OWN
 
+# Mortar Mayhem keeps these as the original has them: an agent that fails at the last command has 1 in both.
+COUNT_A_FAILED_COMMAND = ("commands_completed", "success")
+
 
 def ground_truth_of(infos: dict[str, Any], args: RunArgs, before: np.ndarray | None = None) -> np.ndarray | None:
     """Return the ground truth (N, G) that --ground-truth-coef estimates, None where it is 0.
@@ -68,7 +71,10 @@ def final_numbers(infos: dict[str, Any], ended: np.ndarray) -> dict[str, np.ndar
     """
     numbers = {}
     for lane in np.flatnonzero(ended).tolist():
-        for name, value in final_info_of(infos, lane).items():
+        info = final_info_of(infos, lane)
+        if "carried_out" in info:
+            info = {name: value for name, value in info.items() if name not in COUNT_A_FAILED_COMMAND}
+        for name, value in info.items():
             number = as_number(value)
             if number is not None:
                 numbers.setdefault(str(name), np.full(len(ended), np.nan))[lane] = number

@@ -20,6 +20,7 @@ from tensorboard.backend.event_processing.event_file_loader import EventFileLoad
 from tensorboard.util.tensor_util import make_ndarray
 
 from ppo_utils.checkpoints import FORMER_DEFAULTS, RENAMED, import_script
+from ppo_utils.scores import own_metric
 
 POINTS = 200  # of a curve; one that has more is averaged over neighbours
 # Scalars of every iteration, in seconds: the first is the sum of the others. Evaluations are in none of them.
@@ -73,7 +74,7 @@ def read_run(path: str) -> RunLog:
                 saved = json.load(file)
             curves = {name: (np.cumsum(steps), np.array(values)) for name, (steps, values) in saved["curves"].items()}
             machine = saved.get("machine", RunLog.machine)
-            return RunLog(path, with_defaults(saved["args"]), curves, machine)
+            return with_carried_out(RunLog(path, with_defaults(saved["args"]), curves, machine))
         except (KeyError, TypeError, AttributeError, ValueError, EOFError, zlib.error, gzip.BadGzipFile):
             raise NoCurvesError(f"{path} holds no curves of a training run") from None
     if not os.path.isdir(path):
@@ -85,7 +86,24 @@ def read_run(path: str) -> RunLog:
         if glob.glob(f"{path}/*.json.gz"):
             raise NoCurvesError(f"{path} is a folder of results; give the files themselves, as {path}/*.json.gz")
         raise NoCurvesError(f"{path} holds no curves of a training run")
-    return RunLog(path, hyperparameters(events), event_curves(events))
+    return with_carried_out(RunLog(path, hyperparameters(events), event_curves(events)))
+
+
+def with_carried_out(run: RunLog) -> RunLog:
+    """Return a run of finite Mortar Mayhem with the share of commands carried out, which earlier versions did not log.
+
+    The return tells it, which is 0.1 for each command unless reset options say otherwise.
+    """
+    options = json.loads(run.args.get("env_options", "{}"))
+    counts = options.get("command_count", [10])
+    is_told = len(counts) == 1 and not any(name.startswith("reward_") for name in options)
+    if is_told and own_metric(run.args.get("env_id", "")) == "carried_out":
+        names = {f"{levels}/return": f"{levels}/carried_out" for levels in ("eval", "test")}
+        for of_return, name in (names | {"charts/episodic_return": "episode/carried_out"}).items():
+            if of_return in run.curves and name not in run.curves:
+                steps, returns = run.curves[of_return]
+                run.curves[name] = steps, returns / (0.1 * counts[0])
+    return run
 
 
 def read_events(folder: str) -> EventAccumulator:

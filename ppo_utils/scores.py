@@ -4,17 +4,17 @@ Shape letters: R seeds (training runs) of an agent, M levels, E episodes on each
 """
 
 import json
+import math
 import re
 from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.stats import trim_mean
 
 # A family's own metric (6.1.3), by the beginning of the id; any other environment's is the return.
 OWN_METRIC = {
-    "MortarMayhem": "commands_completed",
+    "MortarMayhem": "carried_out",
     "Endless-MortarMayhem": "commands_completed",
     "MysteryPath": "success",
     "SearingSpotlights": "success",
@@ -32,7 +32,10 @@ def iqm(scores: np.ndarray) -> np.ndarray:
 
     As many are left out as fit whole into a quarter: with three scores none, with five the lowest and the highest.
     """
-    return trim_mean(scores.reshape(*scores.shape[:-3], -1), 0.25, axis=-1)
+    pooled = scores.reshape(*scores.shape[:-3], -1)
+    quarter = pooled.shape[-1] // 4
+    end = pooled.shape[-1] - quarter
+    return np.partition(pooled, (quarter, end - 1), axis=-1)[..., quarter:end].mean(-1)
 
 
 def interval(scores: np.ndarray) -> np.ndarray | None:
@@ -54,6 +57,17 @@ def interval(scores: np.ndarray) -> np.ndarray | None:
     return np.percentile(iqms[..., which.ravel()], [2.5, 97.5], axis=-1)  # of (..., B)
 
 
+def error_over_levels(scores: np.ndarray) -> float | None:
+    """Return the standard error of the mean of scores (R, M, E) for other levels; None of several seeds, or one level.
+
+    Where there are several seeds, their differences count too, which the bootstrap's interval shows.
+    """
+    seeds, levels, _ = scores.shape
+    if seeds > 1 or levels < 2:
+        return None
+    return float(scores[0].mean(-1).std(ddof=1)) / math.sqrt(levels)
+
+
 def summary(agent: str, runs: dict[str, int | None], scores: dict[str, np.ndarray]) -> dict[str, Any]:
     """Return what to report of an agent, for JSON: scores (R, M, E) by metric.
 
@@ -61,7 +75,7 @@ def summary(agent: str, runs: dict[str, int | None], scores: dict[str, np.ndarra
     """
     metrics = {}
     for name, values in scores.items():
-        metrics[name] = {"mean": float(values.mean())}
+        metrics[name] = {"mean": float(values.mean()), "error_over_levels": error_over_levels(values)}
         for suffix, each in (("", values), ("_of_levels", values.mean(-1, keepdims=True))):
             ends = interval(each)
             metrics[name][f"iqm{suffix}"] = float(iqm(each))
@@ -73,21 +87,27 @@ def summary(agent: str, runs: dict[str, int | None], scores: dict[str, np.ndarra
 def table(agents: list[dict[str, Any]]) -> str:
     """Return the summaries as a Markdown table, the agents below each other for every metric.
 
-    Below it is a line for each agent whose seeds were trained for different numbers of steps.
+    Intervals are there if an agent has several seeds. Below it is a line that says what is not in the numbers of a
+    single one, and a line for each agent whose seeds were trained for different numbers of steps.
     """
-    lines = [
-        "| metric | agent | seeds | mean | IQM | 95 % interval | IQM of level means | 95 % interval |",
-        "|---|---|---:|---:|---:|---|---:|---|",
-    ]
+    has_intervals = any(len(agent["runs"]) > 1 for agent in agents)
+    ends_of = ["95 % interval"] * has_intervals
+    header = ["metric", "agent", "seeds", "mean", "IQM", *ends_of, "IQM of level means", *ends_of]
+    dashes = ["---" if name in ("metric", "agent", "95 % interval") else "---:" for name in header]
+    lines = [f"| {' | '.join(header)} |", f"|{'|'.join(dashes)}|"]
     for metric in agents[0]["metrics"]:
         for agent in agents:
             score = agent["metrics"][metric]
-            cells = [metric, agent["agent"], len(agent["runs"]), f"{score['mean']:.3f}"]
+            error = score["error_over_levels"]
+            mean = f"{score['mean']:.3f}" + ("" if error is None else f" ± {error:.3f}")
+            cells = [metric, agent["agent"], len(agent["runs"]), mean]
             for suffix in ("", "_of_levels"):
                 ends = score[f"interval{suffix}"]
                 cells += [f"{score[f'iqm{suffix}']:.3f}"]
-                cells += ["none: one seed" if ends is None else "{:.3f} to {:.3f}".format(*ends)]
+                cells += ["" if ends is None else "{:.3f} to {:.3f}".format(*ends)] * has_intervals
             lines.append(f"| {' | '.join(map(str, cells))} |")
+    if any(len(agent["runs"]) == 1 for agent in agents):
+        lines.append("\n± of one seed is the standard error over levels; other seeds would differ by more")
     for agent in agents:
         if len({*agent["steps"]}) > 1:
             steps = ", ".join("an unknown number" if step is None else f"{step:,}" for step in agent["steps"])

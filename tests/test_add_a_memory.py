@@ -52,7 +52,7 @@ def test_the_memory_of_the_page(tmp_path):
     tests = ("tests/test_memory.py", "tests/test_resume.py", "-k", "mingru")
     told = python("-m", "pytest", "-p", "no:cacheprovider", *tests)
     assert int(re.search(r"(\d+) passed", told).group(1)) >= 19
-    few = ["--seeds", "1", "--steps-scale", "0.02", "--evaluations", "1", "--test-levels", "5"]
+    few = ["--seeds", "1", "--steps", "2e4", "--evaluations", "1", "--test-levels", "5"]
     learning = ("benchmarks/learning.py", "--tasks", "mortar-mayhem", "--agents", "ppo_mingru.py", *few)
     assert "\n| ppo_mingru.py | 0." in python(*learning)
     (model,) = tmp_path.glob("learning/runs/*/model.pt")

@@ -75,6 +75,13 @@ def test_a_comparison_is_no_more_often_wrong_than_it_says(seeds, level, both):
     assert np.mean(np.array(p_values) < 0.01) < 0.02
 
 
+def test_degrees_of_freedom_of_the_levels():
+    """Equal seeds, two levels, whose differences 1 and 3 have a variance of 2: one degree, as of two numbers."""
+    found = tables.Comparison.of(np.tile([1.0, 3.0], (3, 1)), np.zeros((3, 2)))
+    assert found.errors == pytest.approx(2.0)
+    assert found.p_value == pytest.approx(2 * scipy.stats.t.sf(2.0, 1))
+
+
 def test_holm_by_hand():
     """Of four at 5 %, the smallest has to be below 1.25 %, the next below 1.67 %, then 2.5 % and 5 %."""
     assert claims.holm([0.04, 0.01, 0.03, 0.016]) == [False, True, False, True]
@@ -93,6 +100,7 @@ def test_where_nobody_is_above_an_agent_without_memory_nothing_was_learned():
     low, high = runs(1.0, 1.1, 0.9), runs(2.0, 2.1, 1.9)
     assert claims.is_learned(claim, {"GRU": low, "TrXL": high}, low)
     assert not claims.is_learned(claim, {"GRU": low, "TrXL": low}, low)
+    assert not claims.is_learned(claim, {"GRU": low, "TrXL": low}, low[:2]), "two without memory are enough"
     assert not claims.is_learned(claim, {"no memory": high, "TrXL": low}, high)
     assert claims.is_learned(claim, {"GRU": low, "TrXL": low}, []), "not known"
     assert claims.is_learned(claim, {"GRU": low[:1], "TrXL": low[:1]}, low[:1]), "nor with one seed"
@@ -141,7 +149,7 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     agents = {name: f"{flags} {small}" for name, flags in suites.AGENTS.items()}
     monkeypatch.setattr(learning, "AGENTS", agents)
     config = claims.Config(
-        claims=("normalized-gradients",), steps_scale=64 / 1e6, seeds=(1, 2), evaluations=1, folder=tmp_path / "runs"
+        claims=("normalized-gradients",), steps=64, seeds=(1, 2), evaluations=1, folder=tmp_path / "runs"
     )
     config.results, config.test_levels = tmp_path / "results", 2
     claims.main(config)

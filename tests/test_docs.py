@@ -223,7 +223,7 @@ def test_nobody_has_to_train_again_what_is_in_the_repository(command):
         run = learning.result_of(config, plan)
         assert run is not None, f"there is no result of {plan}"
         assert learning.has_all_steps(run)
-        assert len(run.curves[f"eval/{plan.task.metric}"][0]) >= config.evaluations
+        assert len(run.curves[f"eval/{plan.task.score}"][0]) >= config.evaluations
 
 
 OPTIONS = sorted({call for _, call in COMMANDS.values() if "--env-options" in call})

@@ -249,7 +249,7 @@ def test_options_go_over_those_of_the_training(saved):
 @pytest.mark.parametrize(
     ("env_id", "name", "value", "shown"),
     [
-        ("MortarMayhem-Grid-v0", "commands_completed", 1.0, "100 %"),
+        ("MortarMayhem-Grid-v0", "carried_out", 1.0, "100 %"),
         ("Endless-MortarMayhem-v0", "commands_completed", 1.0, "1"),
         ("SearingSpotlights-v0", "coins_collected", 0.5, "50 %"),
         ("Endless-SearingSpotlights-v0", "coins_collected", 2.0, "2"),

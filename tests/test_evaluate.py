@@ -100,8 +100,16 @@ def test_one_seed_has_no_interval():
     assert interval(np.zeros((1, 50, 3))) is None
     agent = summary("gru", {"a": 64}, {"return": np.array([[[0.0, 2.0], [2.0, 2.0]]])})
     assert agent["metrics"]["return"]["interval"] is None
-    told = "| return | gru | 1 | 1.500 | 2.000 | none: one seed | 1.500 | none: one seed |"
-    assert table([agent]).splitlines()[-1] == told
+    head, _, row, _, note = table([agent]).splitlines()
+    assert head == "| metric | agent | seeds | mean | IQM | IQM of level means |"
+    assert row == "| return | gru | 1 | 1.500 ± 0.500 | 2.000 | 1.500 |", "levels' means are 1 and 2"
+    assert note == "± of one seed is the standard error over levels; other seeds would differ by more"
+    two = summary("trxl", {"a": 64, "b": 64}, {"return": np.array([[[0.0]], [[2.0]]])})
+    *_, one_seed, two_seeds, _, _ = table([agent, two]).splitlines()
+    assert one_seed == "| return | gru | 1 | 1.500 ± 0.500 | 2.000 |  | 1.500 |  |"
+    assert two_seeds == "| return | trxl | 2 | 1.000 | 1.000 | 0.000 to 2.000 | 1.000 | 0.000 to 2.000 |"
+    assert "±" not in table([two])
+    assert "| 1.000 |" in table([summary("gru", {"a": 64}, {"return": np.ones((1, 1, 3))})]), "one level has no error"
 
 
 def test_iqm_of_episodes_and_of_level_means():
@@ -388,6 +396,27 @@ def test_the_levels_of_an_older_run():
     assert (steps.tolist(), scores.tolist()) == ([10, 20], [[[1], [3]], [[1.5], [3.5]]])
 
 
+def test_what_an_older_run_of_mortar_mayhem_carried_out():
+    """It is told by the return, 0.1 for each command, and not by a metric that counts a failed last command."""
+
+    def older(options):
+        with SummaryWriter(options) as writer:
+            rows = f"|seed|3|\n|env_id|MortarMayhem-Grid-v0|\n|env_options|{options}|"
+            writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
+            writer.add_scalar("charts/episodic_return", 0.3, 10)
+            writer.add_scalar("episode/commands_completed", 1.0, 10)
+            writer.add_scalar("eval/return", 0.15, 10)
+            writer.add_tensor("eval_levels/return", torch.tensor([[0.1, 0.2], [0.2, 0.1]]), 10)
+        return read_run(options).curves
+
+    found = older('{"command_count": [4]}')
+    assert found["eval/carried_out"][1] == pytest.approx(np.array([[[0.25, 0.5], [0.5, 0.25]]]))
+    assert found["episode/carried_out"][1].item() == pytest.approx(0.75)
+    assert older("{}")["episode/carried_out"][1].item() == pytest.approx(0.3)
+    for unknown in ('{"command_count": [2, 4]}', '{"reward_command_success": 1.0}'):
+        assert "eval/carried_out" not in older(unknown)
+
+
 def test_a_picture_goes_to_a_folder_that_is_not_there_yet():
     with SummaryWriter("run-1") as writer:
         writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|1|\n|env_id|A-v0|\n|exp_name|$_$^|")
@@ -647,6 +676,12 @@ def test_episodes_in_batches(agents, monkeypatch, at_once):
     assert np.array_equal(scores_of(agents, levels=12, repeats=2, deterministic=True)[0], wanted)
 
 
+def test_batches_of_a_level_draw_other_actions(agents, monkeypatch):
+    monkeypatch.setattr(evaluate, "AT_ONCE", 8)
+    lengths = scores_of(agents, levels=1, repeats=16)[0]
+    assert not np.array_equal(lengths[0, :8], lengths[0, 8:])
+
+
 def test_other_levels(agents):
     usual, _ = scores_of(agents, levels=6, deterministic=True)
     moved, title = scores_of(agents, levels=4, deterministic=True, start_level=17)
@@ -756,7 +791,7 @@ def test_a_metric_that_one_of_two_tasks_has(tiny, capsys):
     for env_id in ("MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"):
         paths.append(str(ppo_gru.main(tiny(env_id=env_id, obs_type="vector", save_model=True)) / "model.pt"))
     few = {"levels": 1, "repeats": 1, "cuda": False}
-    evaluate.main(evaluate.Config(tuple(paths), metrics=("commands_completed",), json="scores.json", **few))
+    evaluate.main(evaluate.Config(tuple(paths), metrics=("carried_out",), json="scores.json", **few))
     (task,) = json.loads(Path("scores.json").read_text())
     assert task["task"].startswith("MortarMayhemB-Grid-v0")
     assert "MysteryPath-Grid-v0, levels 100000 to 100000, 1 times each: not every" in capsys.readouterr().err
@@ -801,9 +836,21 @@ def test_bad_input(agents, tmp_path):
             evaluate.main(evaluate.tyro.cli(evaluate.Config, args=words))
 
 
-def test_the_command_prints_one_line_and_fails(tmp_path):
-    done = subprocess.run(
-        [sys.executable, evaluate.__file__, "nowhere.pt"], capture_output=True, text=True, timeout=300
-    )
+def test_drawing_alone_needs_the_extra(agents, monkeypatch, capsys):
+    for name in ("matplotlib", "scipy"):
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, "ppo_utils.curves")
+    evaluate.main(evaluate.Config((f"{agents[0]}/model.pt",), max_steps=3, **FEW))
+    assert "| return | ppo_gru | 1 |" in capsys.readouterr().out
+    with pytest.raises(ImportError, match=r'to draw needs matplotlib.*: pip install -e "\.\[eval\]"'):
+        evaluate.main(evaluate.Config(curves=(agents[0],)))
+
+
+def test_the_command_prints_one_line_and_fails():
+    """Here without what only drawing needs."""
+    hide = "import runpy, sys; sys.modules |= dict.fromkeys(['matplotlib', 'scipy', 'PIL', 'plotly'])"
+    code = f"{hide}; runpy.run_path({evaluate.__file__!r}, run_name='__main__')"
+    line = [sys.executable, "-c", code, "nowhere.pt"]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=300)
     assert done.returncode == 1
     assert done.stderr == "evaluate.py: there is no file nowhere.pt; --save-model writes model.pt to the run folder\n"

@@ -72,7 +72,7 @@ def test_a_lane_plays_its_level_once(played, script, monkeypatch):
             ended = terminated or truncated
         assert found["return"][lane] == pytest.approx(sum(rewards))
         assert found["length"][lane] == len(rewards)
-        assert found["commands_completed"][lane] == info["commands_completed"]
+        assert found["carried_out"][lane] == info["carried_out"]
 
 
 @EACH_SCRIPT
@@ -112,7 +112,7 @@ def test_training_goes_on_as_if_there_had_been_none(tiny, curves, script):
     args = tiny(script, env_id="MortarMayhemB-Grid-v0", total_timesteps=4 * 64, **FEW)
     without = curves(script.main(args))
     evaluated = curves(script.main(dataclasses.replace(args, eval_interval=3)))
-    assert [step for step, _ in evaluated["eval/commands_completed"]] == [192, 256]
+    assert [step for step, _ in evaluated["eval/carried_out"]] == [192, 256]
     assert [step for step, _ in evaluated["eval/return"]] == [192, 256]
     for name in without:
         assert evaluated[name] == without[name], name

@@ -35,8 +35,8 @@ ROOT = Path(__file__).parents[1]
 @pytest.mark.parametrize("task", learning.TASKS)
 @pytest.mark.parametrize("agent", learning.AGENTS)
 def test_every_agent_s_command_can_be_parsed(task, agent):
-    args = learning.plan(learning.Config(steps_scale=6), learning.TASKS[task], agent, 2).args
-    assert args.total_timesteps == args.anneal_steps == 6 * learning.TASKS[task].total_timesteps
+    args = learning.plan(learning.Config(steps=6_000_000), learning.TASKS[task], agent, 2).args
+    assert args.total_timesteps == args.anneal_steps == 6_000_000
     assert args.refresh_memory == ("refreshed" in agent)
     of_a_preset = agent.startswith(("TrXL, preset", "TrXL, Muon"))  # the thesis' queries do not know their step
     assert getattr(args, "trxl_query_position", False) == of_a_preset
@@ -64,9 +64,8 @@ def test_an_agent_may_have_further_flags(tmp_path):
         ({"jobs": 0}, "--jobs is 0; it must be 1 or more"),
         ({"evaluations": 0}, "--evaluations is 0; it must be 1 or more"),
         ({"test_levels": 0}, "--test-levels is 0; it must be 1 or more"),
-        ({"steps_scale": 0}, "--steps-scale is 0; it must be above 0 and at most 1000"),
-        ({"steps_scale": float("nan")}, "--steps-scale is nan; it must be above 0 and at most 1000"),
-        ({"steps_scale": float("inf")}, "--steps-scale is inf; it must be above 0 and at most 1000"),
+        ({"steps": 0}, "--steps is 0; it must be 1 or more"),
+        ({"steps": 2**63}, r"--steps is 9223372036854775808; it must be below 2 \*\* 63"),
     ],
 )
 def test_numbers_that_no_training_can_have(wrong, message):
@@ -133,7 +132,7 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     config = learning.Config(
         tasks=("mortar-mayhem",),
         agents=(agent,),
-        steps_scale=3 * 128 / task.total_timesteps,
+        steps=3 * 128,
         seeds=(1,),
         evaluations=3,
         test_levels=5,
@@ -164,7 +163,7 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     assert kept.args == whole.args
     assert (kept.machine, whole.machine) == (learning.machine(), "not recorded")
     assert f" {os.cpu_count()} cores, PyTorch {torch.__version__}" in kept.machine
-    scores = ("eval/commands_completed", "eval/return", "eval/length")
+    scores = ("eval/carried_out", "eval/return", "eval/length")
     for name in (*scores, "charts/seconds_iteration", *learning.UPDATE_CURVES):
         for one, other in zip(kept.curves[name], whole.curves[name], strict=True):
             assert one == pytest.approx(other, rel=1e-3)
@@ -265,16 +264,16 @@ def test_a_run_without_a_score_at_its_end_is_no_result(last, tested, tmp_path, m
     end = plan.args.total_timesteps // 4096 * 4096
     curves = {name: (np.array([end]), np.ones((1, 1, 1))) for name in SECONDS.values()}
     if last is not None:
-        curves["eval/commands_completed"] = np.array([end if last == "end" else last]), np.ones((1, 1, 1))
+        curves["eval/carried_out"] = np.array([end if last == "end" else last]), np.ones((1, 1, 1))
     folder = tmp_path / "run"
     folder.mkdir()
     write_model(folder, end)
     run = RunLog(str(folder), plan.logged_args(), curves)
     monkeypatch.setattr(learning, "runs_in", lambda place, plan: [run])
-    test = {"test/commands_completed": ([end], np.ones((1, 5, 1)))} if tested else {}
+    test = {"test/carried_out": ([end], np.ones((1, 5, 1)))} if tested else {}
     monkeypatch.setattr(learning, "test_scores", lambda *_: test)
     monkeypatch.setattr(learning, "train", lambda *_: pytest.fail("it has been trained"))
-    with pytest.raises(SystemExit, match=r"GRU on .*, has no commands_completed at its end: an evaluation was cut"):
+    with pytest.raises(SystemExit, match=r"GRU on .*, has no carried_out at its end: an evaluation was cut"):
         learning.write_result(config, plan)
     assert not (tmp_path / "results").exists()
 
@@ -305,7 +304,7 @@ def test_a_log_tells_how_far_its_training_is(tmp_path):
             assert learning.steps_so_far(config, plan) == seen
         bar.close()
     assert learning.steps_so_far(config, other) == 0, "another seed has not begun"
-    longer = learning.plan(replace(config, steps_scale=12), learning.TASKS["mortar-mayhem"], "GRU", 1)
+    longer = learning.plan(replace(config, steps=12_000_000), learning.TASKS["mortar-mayhem"], "GRU", 1)
     assert learning.steps_so_far(config, longer) == 0, "nor has a longer training"
 
 

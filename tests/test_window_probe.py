@@ -25,14 +25,14 @@ def test_rows_of_the_windows(tiny, monkeypatch, capsys):
     window_probe.main(window_probe.Config("model.pt", windows=(3, 7, 100, 200), levels=3, repeats=2))
     assert windows == [3, 7, 100, 200]
     told = capsys.readouterr().out.splitlines()
-    assert told[0].startswith("| window | commands_completed, mean | IQM |")
+    assert told[0].startswith("| window | carried_out, mean | IQM |")
     narrow, trained, wide, wider = (row.strip("| ").split(" | ") for row in told[2:])
     assert (narrow[0], trained[0]) == ("3", "7, as trained")
     assert float(wide[-1]) < 100
     assert wide[1:] == wider[1:], "no episode is longer"
 
     played = play(evaluate.Checkpoint.read("model.pt"), evaluate.Config(levels=3, repeats=2))
-    assert float(trained[1]) == pytest.approx(played["commands_completed"].mean(), abs=0.005)
+    assert float(trained[1]) == pytest.approx(played["carried_out"].mean(), abs=0.005)
     assert float(trained[4]) == np.max(played["length"])
 
 
