@@ -8,6 +8,9 @@
     video          videos of the first environment
     infos          what a training counts and logs of their infos
     evaluation     scores on levels that are not trained on
+    scores         interquartile means and their table; which runs are seeds of one agent
+    run_logs       what runs have logged, read again
+    curves         pictures and tables of that
     acting         a trained agent in a program of one's own
     run            what a training run consists of
     runs           a training from its command line to its end: run folder, signals

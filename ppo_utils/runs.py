@@ -6,6 +6,7 @@ each iteration. `run_to_end` calls `train`; `command` calls `setup`, then `run_t
 
 import argparse
 import contextlib
+import importlib.util
 import math
 import os
 import re
@@ -323,6 +324,9 @@ def summary(args: RunArgs, run: Run) -> str:
     installed = Path(__file__).with_name("evaluate.py").exists()
     evaluate, enjoy = ("-m ppo_utils.evaluate", "-m ppo_utils.enjoy") if installed else ("evaluate.py", "enjoy.py")
     script = f"-m {run.script}" if installed else f"{run.script}.py"
+    lacking = not all(map(importlib.util.find_spec, ("PIL", "plotly")))  # which enjoy.py needs
+    extra = "memory-gym-baselines[eval]" if installed else '-e ".[eval]"'
+    install = f"pip install {extra} && " if lacking else ""
     lines = [f"{run.folder}: {run.step:,} steps, {score}"]
     checkpoints = checkpoints_in(run.folder)[-1:]
     if run.stop and checkpoints:
@@ -332,7 +336,7 @@ def summary(args: RunArgs, run: Run) -> str:
         lines.append(f"evaluate: python {evaluate} {model}")
         with contextlib.suppress(ValueError):
             check_draws("enjoy.py", args.env_id)
-            lines.append(f"watch: python {enjoy} {model} --out page.html")
+            lines.append(f"watch: {install}python {enjoy} {model} --out page.html")
     return "\n".join([*lines, f"plot: tensorboard --logdir {folder}"])
 
 

@@ -160,7 +160,7 @@ def test_weights_that_were_renamed(tiny):
 def test_logs_every_number_of_the_final_info(tiny, scalars):
     options = '{"command_count": [2], "explosion_delay": [3], "explosion_duration": [1]}'
     curves = scalars(ppo_gru.main(tiny(env_id="MortarMayhemB-Grid-v0", env_options=options)))
-    numbers = {"episode/reward", "episode/length", "episode/success", "episode/commands_completed"}
+    numbers = {"episode/reward", "episode/length", "episode/carried_out"}
     assert {name for name in curves if name.startswith("episode/")} == numbers
     assert curves["episode/reward"] == curves["charts/episodic_return"]
     assert curves["episode/length"] == curves["charts/episodic_length"]
@@ -404,7 +404,16 @@ def test_presets(script):
     assert (given.num_steps, given.env_id, given.trunk_size) == (7, "CartPole-v1", held["trunk_size"])
 
 
-def test_the_last_lines(tiny, capsys):
+def test_a_run_that_is_extended_keeps_its_schedule(monkeypatch):
+    args = ppo_gru.Args(**ppo_gru.PRESETS["laptop"])
+    check_args(args)  # as a training does
+    saved = {"args": dataclasses.asdict(args)}
+    monkeypatch.setattr(runs, "read_checkpoint", lambda folder: saved)
+    args = parse_args(ppo_gru, "--resume", "runs/x", "--total-timesteps", "2e8")
+    assert (args.preset, args.total_timesteps, args.anneal_steps) == ("laptop", 2e8, 6_000_000)
+
+
+def test_the_last_lines(tiny, capsys, monkeypatch):
     """The folder with the score, and the commands that evaluate, watch and plot."""
     args = tiny(env_id="MortarMayhemB-Grid-v0", total_timesteps=256, num_steps=64)
     folder = ppo_gru.main(args)
@@ -416,10 +425,13 @@ def test_the_last_lines(tiny, capsys):
         f"watch: python enjoy.py {checkpoint} --out page.html",
         f"plot: tensorboard --logdir {folder}",
     ]
+    find_spec = runs.importlib.util.find_spec
+    monkeypatch.setattr(runs.importlib.util, "find_spec", lambda name: None if name == "plotly" else find_spec(name))
     folder = ppo_gru.main(dataclasses.replace(args, eval_interval=1, eval_levels=2, save_model=True, exp_name="b"))
     score, *commands = capsys.readouterr().out.splitlines()
     assert re.fullmatch(rf"{folder}: 256 steps, return -?\d\.\d\d on 2 unseen levels", score)
     assert commands[0] == f"evaluate: python evaluate.py {folder / 'model.pt'}"
+    assert commands[1].startswith('watch: pip install -e ".[eval]" && python enjoy.py')
     folder = ppo_gru.main(tiny(env_id="MysteryPath-v0", checkpoint_interval=0, exp_name="c d"))
     told = [f"{folder}: 128 steps, no episode ended", f"plot: tensorboard --logdir '{folder}'"]
     assert capsys.readouterr().out.splitlines() == told
