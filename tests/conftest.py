@@ -33,6 +33,17 @@ SCRIPTS = [ppo_gru, ppo_trxl, *OTHERS]
 SMALL = {"hidden_size": 32, "trxl_dim": 32, "trxl_num_heads": 2, "trxl_num_layers": 2, "trxl_memory_length": 7}
 
 
+def pytest_terminal_summary(terminalreporter):
+    """Say in one line what no browser could look at."""
+    skipped = [report for report in terminalreporter.stats.get("skipped", ()) if "no browser" in str(report.longrepr)]
+    if skipped:
+        terminalreporter.write_line(
+            f"no browser: {len(skipped)} tests of the page of enjoy.py are skipped; apt-get install chromium "
+            "chromium-driver",
+            yellow=True,
+        )
+
+
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path, monkeypatch):
     """Let every test write its runs to a folder of its own."""

@@ -33,6 +33,7 @@ from ppo_utils.scores import RESAMPLES, agents_of, interval, iqm, own_metric, su
 from tables import standard_error
 
 TASK = {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "num_levels": 10, "start_level": 5, "save_model": True}
+TASK["env_options"] = '{"max_steps": 40}'
 FEW = {"levels": 4, "repeats": 2, "cuda": False}
 
 
@@ -310,8 +311,8 @@ def agents(tiny, tmp_path_factory):
     """The run folders of two seeds of two agents, trained for two iterations with an evaluation after each."""
     settings = {
         **TASK,
-        "num_steps": 128,
-        "total_timesteps": 1024,
+        "num_steps": 64,  # longer than an episode
+        "total_timesteps": 512,
         "eval_interval": 1,
         "eval_levels": 2,
     }
@@ -346,7 +347,7 @@ def test_a_curve_is_the_iqm_with_its_band(agents, scalars):
     gru, trxl = axis.lines
     assert np.allclose(gru.get_ydata(), curves[:2].mean(0))  # a quarter of two seeds is none
     assert np.allclose(trxl.get_ydata(), curves[2])
-    assert gru.get_xdata().tolist() == [512, 1024]
+    assert gru.get_xdata().tolist() == [256, 512]
     assert (gru.get_color(), trxl.get_color()) == ("C0", "C1")
     (band,) = axis.collections  # a single seed has none
     low, high = band.get_paths()[0].get_extents().intervaly
@@ -412,6 +413,11 @@ def test_what_an_older_run_of_mortar_mayhem_carried_out():
     found = older('{"command_count": [4]}')
     assert found["eval/carried_out"][1] == pytest.approx(np.array([[[0.25, 0.5], [0.5, 0.25]]]))
     assert found["episode/carried_out"][1].item() == pytest.approx(0.75)
+    with SummaryWriter("newer") as writer:
+        writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|3|\n|env_id|MortarMayhem-v0|")
+        for name, value in (("return", 0.3), ("carried_out", 0.4)):  # a wrapper may have changed the rewards
+            writer.add_scalar(f"eval/{name}", value, 10)
+    assert read_run("newer").curves["eval/carried_out"][1].item() == pytest.approx(0.4)
     assert older("{}")["episode/carried_out"][1].item() == pytest.approx(0.3)
     for unknown in ('{"command_count": [2, 4]}', '{"reward_command_success": 1.0}'):
         assert "eval/carried_out" not in older(unknown)
@@ -627,7 +633,7 @@ def test_scores_are_those_of_the_levels(agents, capsys):
     models = tuple(f"{folder}/model.pt" for folder in agents)
     evaluate.main(evaluate.Config(models, json="scores.json", **FEW))
     said = capsys.readouterr().out
-    assert said.startswith("MysteryPath-Grid-v0, levels 15 to 18, 2 times each\n")
+    assert said.startswith('MysteryPath-Grid-v0 {"max_steps": 40}, levels 15 to 18, 2 times each\n')
     (task,) = json.loads(Path("scores.json").read_text())
     assert task["finished"] == 1
     gru, trxl = task["agents"]
@@ -674,6 +680,16 @@ def test_episodes_in_batches(agents, monkeypatch, at_once):
     wanted, _ = scores_of(agents, levels=12, repeats=2, deterministic=True)
     monkeypatch.setattr(evaluate, "AT_ONCE", at_once)
     assert np.array_equal(scores_of(agents, levels=12, repeats=2, deterministic=True)[0], wanted)
+
+
+def test_what_one_batch_alone_reports_is_unknown_in_the_others(agents, monkeypatch):
+    found = iter([{"return": np.ones(4), "coins": np.ones(4)}, {"return": np.ones(4)}])
+    monkeypatch.setattr(evaluate, "evaluate", lambda *_, **__: next(found))
+    monkeypatch.setattr(evaluate, "AT_ONCE", 4)
+    checkpoint = evaluate.Checkpoint.read(f"{agents[0]}/model.pt")
+    played = evaluate.play(checkpoint, evaluate.Config(levels=4, repeats=2, cuda=False))
+    assert np.isnan(played["coins"]).tolist() == [[False] * 2] * 2 + [[True] * 2] * 2
+    assert (played["return"] == 1).all()
 
 
 def test_batches_of_a_level_draw_other_actions(agents, monkeypatch):

@@ -32,8 +32,12 @@ from suites import short
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.mark.parametrize("task", learning.TASKS)
-@pytest.mark.parametrize("agent", learning.AGENTS)
+# Flags of tasks and of agents do not depend on each other: each agent in a task, and two scripts in each task.
+EACH = [(agent, "mystery-path") for agent in learning.AGENTS]
+EACH += [(agent, task) for agent in ("GRU", "TrXL") for task in learning.TASKS if task != "mystery-path"]
+
+
+@pytest.mark.parametrize(("agent", "task"), EACH)
 def test_every_agent_s_command_can_be_parsed(task, agent):
     args = learning.plan(learning.Config(steps=6_000_000), learning.TASKS[task], agent, 2).args
     assert args.total_timesteps == args.anneal_steps == 6_000_000
@@ -316,14 +320,17 @@ def test_results_as_one_table(tmp_path, capsys):
     test = {"test/return": ([300], np.full((1, 7, 1), 2.5))}
     (tmp_path / "X-v0").mkdir()
     learning.write_run(replace(run, curves=run.curves | seconds | test), f"{tmp_path}/X-v0/run.json.gz")
+    unmeasured = {"eval/return": (np.array([100]), scores[:1])}  # as earlier versions did, which had no seconds
+    learning.write_run(RunLog("", args | {"seed": "4"}, unmeasured), f"{tmp_path}/X-v0/unmeasured.json.gz")
     learning.main(learning.Config(results=tmp_path, csv=tmp_path / "all.csv"))
-    assert capsys.readouterr().out == f"{tmp_path}/all.csv: the scores of 1 runs\n"
+    assert capsys.readouterr().out == f"{tmp_path}/all.csv: the scores of 2 runs\n"
     assert (tmp_path / "all.csv").read_text().splitlines() == [
         "env_id,env_options,exp_name,script,seed,levels,metric,step,hours,mean,episodes",
         "X-v0,{},GRU,ppo_gru,3,development,return,100,0.0100,1,8",
         "X-v0,{},GRU,ppo_gru,3,development,return,200,0.0200,2,8",
         "X-v0,{},GRU,ppo_gru,3,development,return,300,0.0300,3,8",
         "X-v0,{},GRU,ppo_gru,3,test,return,300,0.0300,2.5,7",
+        "X-v0,{},GRU,ppo_gru,4,development,return,100,nan,1,8",
     ]
 
 
@@ -331,10 +338,10 @@ def test_hours_of_trainings_are_expected_by_those_that_are_there(tmp_path):
     config = learning.Config(results=tmp_path, jobs=2)
     plans = [learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", seed) for seed in (1, 2)]
     assert learning.expected_hours(config, plans) == ""
-    curves = {name: (np.array([7200]), np.full((1, 1, 1), 36.0)) for name in SECONDS.values()}
-    run = RunLog("", plans[0].logged_args(), curves)  # 200 steps a second
     (tmp_path / "X-v0").mkdir()
-    learning.write_run(run, f"{tmp_path}/X-v0/run.json.gz")
+    for speed in (100, 200, 900):  # steps a second; what counts is the middle one
+        curves = {name: (np.array([36 * speed]), np.full((1, 1, 1), 36.0)) for name in SECONDS.values()}
+        learning.write_run(RunLog("", plans[0].logged_args(), curves), f"{tmp_path}/X-v0/{speed}.json.gz")
     assert learning.expected_hours(config, plans) == ", about 1.4 hours"  # two million steps, two at a time
 
 
