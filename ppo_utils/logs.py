@@ -91,7 +91,7 @@ def write_logs(args: RunArgs, run: Run, logs: dict[str, float], episodes: dict[s
     for name, values in episodes.items():
         logs[name] = float(np.mean(values))
         if len(values) < ended:  # a metric that not all of them report
-            logs[f"{name}_count"] = len(values)
+            logs[name.replace("episode/", "episode_count/", 1)] = len(values)
     logs["charts/SPS"] = run.step / run.seconds
     for name, value in logs.items():
         run.writer.add_scalar(name, value, run.step)

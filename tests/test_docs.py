@@ -277,7 +277,7 @@ def test_page_names_the_curves(tiny, scalars):
         logged |= set(scalars(script.main(tiny(script, **changes))))
     logged = {re.sub("^(episode|eval)/.*", r"\1/NAME", name) for name in logged} | {"eval_levels/NAME"}
     named = {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
-    assert named == logged | {"episode/NAME_count"}  # which only environments of others need
+    assert named == logged | {"episode_count/NAME"}  # which only environments of others need
 
 
 def test_page_plays_an_agent(monkeypatch, capsys):

@@ -117,11 +117,12 @@ def test_infos_that_gymnasium_cannot_batch():
 @EACH_SCRIPT
 def test_over_how_many_episodes_a_mean_is(tiny, script, scalars):
     """Lanes 0 and 1 say it, lanes 2 and 3 do not: 16 steps are 5 episodes of each."""
-    tell = lambda env: {"score": 0.5 * env.number} if env.number < 2 else {}  # noqa: E731
+    tell = lambda env: {"score": 0.5 * env.number, "score_count": 3} if env.number < 2 else {}  # noqa: E731
     found = scalars(script.main(tiny(script, env_id=small(count=itertools.count(), tell=tell))))
     assert found["episode/score"] == [0.25, 0.25]
-    assert found["episode/score_count"] == [10, 10]
-    assert not any(name.endswith("_count") for name in found if "score" not in name)
+    assert found["episode/score_count"] == [3, 3], "the environment's own"
+    counts = {name: values for name, values in found.items() if name.startswith("episode_count/")}
+    assert counts == {"episode_count/score": [10, 10], "episode_count/score_count": [10, 10]}
 
 
 def test_evaluations_say_which_metric_they_leave_out(tiny, capfd, scalars):
