@@ -15,7 +15,6 @@ import contextlib
 import io
 import json
 import math
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -33,6 +32,7 @@ from ppo_utils.errors import RunError
 from ppo_utils.evaluation import first_unseen, make_agent
 from ppo_utils.flags import bounded, check_bounds
 from ppo_utils.infos import final_numbers, ground_truths
+from ppo_utils.terminal import one_line_exit, open_streams
 from ppo_utils.video import as_image, check_draws
 
 try:
@@ -438,9 +438,6 @@ def outcome(episode: Episode, env_id: str) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
+    open_streams()
+    with one_line_exit(ValueError, OSError, ImportError, gym.error.Error, RunError):
         print(main(tyro.cli(Config)))
-    except (ValueError, OSError, ImportError, gym.error.Error, RunError) as error:
-        sys.exit(f"enjoy.py: {' '.join(str(error).split())}")
-    except KeyboardInterrupt:
-        sys.exit(130)

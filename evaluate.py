@@ -39,6 +39,7 @@ from ppo_utils.errors import RunError
 from ppo_utils.evaluation import are_trained_on, evaluate, evaluation_levels, first_unseen, make_agent
 from ppo_utils.flags import NonNegativeInt, PositiveInt, check_bounds
 from ppo_utils.scores import own_metric, summary, table, task_of, tasks_of
+from ppo_utils.terminal import one_line_exit, open_streams
 
 MOST_EPISODES = 100_000
 AT_ONCE = 1000  # episodes; more would take much memory
@@ -225,10 +226,6 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    config = tyro.cli(Config)
-    try:
-        main(config)
-    except (ValueError, OSError, ImportError, gym.error.Error, RunError) as error:
-        sys.exit(f"evaluate.py: {' '.join(str(error).split())}")
-    except KeyboardInterrupt:
-        sys.exit(130)
+    open_streams()
+    with one_line_exit(ValueError, OSError, ImportError, gym.error.Error, RunError):
+        main(tyro.cli(Config))

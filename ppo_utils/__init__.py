@@ -18,6 +18,7 @@
     checkpoints    models and checkpoints: written, read, resumed
     processes      several processes that train one agent
     errors         what ends a training, in one line
+    terminal       where programs write to, which may be closed or gone
     fast           what computes the same faster on a CPU
 
 No module here names a script; `checkpoints.import_script` imports the one that wrote a file.

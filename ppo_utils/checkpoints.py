@@ -28,6 +28,7 @@ from ppo_utils.evaluation import are_trained_on, first_unseen
 from ppo_utils.flags import RunArgs, as_flags, flag
 from ppo_utils.processes import all_gather, rank_and_size
 from ppo_utils.run import Run
+from ppo_utils.terminal import tell
 
 T = TypeVar("T")  # a script's Args
 # Names that flags and weights have in older files.
@@ -214,7 +215,7 @@ def check_resumed(args: RunArgs, saved: dict[str, Any], script: str) -> None:
     theirs = saved_args(type(args), saved)
     if gone := saved["args"].keys() - asdict(theirs).keys():
         names = " ".join(map(flag, sorted(gone)))
-        print(f"--resume {args.resume}: it goes on without {names}, which no longer exist", file=sys.stderr)
+        tell(f"--resume {args.resume}: it goes on without {names}, which no longer exist")
     for name in (each.name for each in fields(args) if each.name not in ("resume", "total_timesteps")):
         if getattr(args, name) != getattr(theirs, name):
             raise ValueError(
@@ -250,10 +251,9 @@ def load_model(args: RunArgs, agent: nn.Module, script: str) -> None:
     first, beyond = first_unseen(args), first_unseen(theirs)
     met = are_trained_on(theirs, first, args.eval_levels)
     if met and theirs.env_id == args.env_id and rank_and_size()[0] == 0:
-        print(
+        tell(
             f"{path} was trained on levels {theirs.start_level} to {beyond - 1}, and evaluations of this run play "
-            f"levels {first} to {first + args.eval_levels - 1}; --start-level {beyond} makes them unseen ones",
-            file=sys.stderr,
+            f"levels {first} to {first + args.eval_levels - 1}; --start-level {beyond} makes them unseen ones"
         )
 
 
@@ -303,7 +303,7 @@ def load_process(run: Run, saved: dict[str, Any]) -> None:
     if arrays["environments"] is None:
         run.return_scale.discounted = None
         if rank == 0:
-            print(f"{run.envs.spec.id} has no state to save: every environment begins a new episode", file=sys.stderr)
+            tell(f"{run.envs.spec.id} has no state to save: every environment begins a new episode")
         return
     load_state(run.envs, arrays["environments"])
     run.carry = replace(run.carry, memory=memory, **arrays["carry"])

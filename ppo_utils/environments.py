@@ -31,6 +31,7 @@ from ppo_utils.flags import RunArgs
 from ppo_utils.lanes import Levels, creator, one_line, one_line_errors, same_step_envs
 from ppo_utils.observations import ObservationParts
 from ppo_utils.processes import rank_and_size
+from ppo_utils.terminal import tell
 from ppo_utils.wrappers import (
     FourierFeatures,
     GrayscaleStack,
@@ -138,7 +139,7 @@ def make_envs(
         envs = wrap_envs(envs, first_lane, **wrappers)
         images = [name for name, part in envs.single_observation_space.items() if len(part.shape) == 3]
         if obs_type != "pixels" and images and not memory_gym:
-            print(f"{env_id} has no {obs_type} to show instead of its {', '.join(images)}", file=sys.stderr)
+            tell(f"{env_id} has no {obs_type} to show instead of its {', '.join(images)}")
 
         if seed is not None:
             with one_line_errors(f"{env_id} cannot be reset"):

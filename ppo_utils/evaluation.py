@@ -4,7 +4,6 @@ Shape letters: N environments, one for each episode.
 """
 
 import functools
-import sys
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from torch import Tensor, nn
 from ppo_utils.environments import as_tensors
 from ppo_utils.flags import RunArgs
 from ppo_utils.infos import final_numbers, ground_truth_of
+from ppo_utils.terminal import tell
 
 REPEATS = 3  # times that each level is played
 MEMORY_STEPS = 64  # that a memory has room for, until `with_room` makes room again
@@ -114,4 +114,4 @@ def level_scores(args: RunArgs, agent: nn.Module, envs: VectorEnv) -> dict[str, 
 @functools.cache
 def tell_incomplete(name: str) -> None:
     """Say, once, that evaluations leave a metric out."""
-    print(f"\nevaluations leave out {name}: not all of their episodes report it", file=sys.stderr)
+    tell(f"\nevaluations leave out {name}: not all of their episodes report it")

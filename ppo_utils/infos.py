@@ -5,7 +5,6 @@ Shape letters: N environments, G entries of the ground truth.
 
 import functools
 import math
-import sys
 from collections import defaultdict
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from ppo_utils.errors import RunError
 from ppo_utils.flags import RunArgs
 from ppo_utils.lanes import OWN
+from ppo_utils.terminal import tell
 
 # Mortar Mayhem keeps these as the original has them: an agent that fails at the last command has 1 in both.
 COUNT_A_FAILED_COMMAND = ("commands_completed", "success")
@@ -112,7 +112,7 @@ def as_number(value: Any) -> float | None:
 @functools.cache
 def tell_left_out(name: str) -> None:
     """Say once that something in the infos is not logged."""
-    print(f"{name}, in the info that ends an episode, is no finite number there, and is left out", file=sys.stderr)
+    tell(f"{name}, in the info that ends an episode, is no finite number there, and is left out")
 
 
 def final_observations(

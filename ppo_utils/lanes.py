@@ -10,7 +10,6 @@ import inspect
 import os
 import secrets
 import signal
-import sys
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -27,6 +26,7 @@ from gymnasium.vector.async_vector_env import AsyncState, _async_worker
 from memory_gym_envs.options import brief
 from ppo_utils.errors import LaneError, RunError
 from ppo_utils.processes import seed_generators
+from ppo_utils.terminal import tell
 
 OWN = "own"  # where an info has a lane's own info, and its `Place`
 
@@ -110,14 +110,14 @@ class Lane(gym.Wrapper):
         try:
             return self.env.render()
         except Exception as error:
-            print(f"environment {self._number} raised {error!r} when it was drawn", file=sys.stderr)
+            tell(f"environment {self._number} raised {error!r} when it was drawn")
 
     def close(self) -> None:
         """Close the environment; what it raises is a line on stderr, since nothing that follows needs it."""
         try:
             super().close()
         except Exception as error:
-            print(f"environment {self._number} raised {error!r} when it was closed", file=sys.stderr)
+            tell(f"environment {self._number} raised {error!r} when it was closed")
 
     @property
     def _place(self) -> Place:

@@ -3,7 +3,6 @@
 Shape letters: N environments, n some of them, H, W and C of an image, V of a vector.
 """
 
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +16,7 @@ from memory_gym_envs.base import lane_seeds
 from memory_gym_envs.options import brief
 from ppo_utils.errors import RunError
 from ppo_utils.lanes import OWN, Place
+from ppo_utils.terminal import tell
 from ppo_utils.wrappers import OBSERVATION, one_hot, rows_of
 
 SMALLEST_IMAGE = 36  # pixels along a side; what is smaller becomes a vector
@@ -45,7 +45,7 @@ class ObservationParts(VectorWrapper):
         leaves = dict(leaves_of(space)) if isinstance(space, CONTAINERS) else {(OBSERVATION,): space}
         texts = [name_of(path) for path, leaf in leaves.items() if is_text(leaf)]
         if texts:
-            print(f"{env.spec.id}: the text {', '.join(texts)} is left out of the observation", file=sys.stderr)
+            tell(f"{env.spec.id}: the text {', '.join(texts)} is left out of the observation")
         self._parts = {name_of(path): Part.of(path, leaf) for path, leaf in leaves.items() if not is_text(leaf)}
         if not self._parts:
             raise ValueError(f"the observation space {brief(space)} is not supported; it is all text")

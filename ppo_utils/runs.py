@@ -19,7 +19,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import fields
 from itertools import count
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from types import ModuleType
+from typing import Any, TypeVar
 
 import filelock
 import gymnasium as gym
@@ -48,6 +49,7 @@ from ppo_utils.flags import RunArgs, as_flags, check_args, check_minibatches, fl
 from ppo_utils.logs import combine_logs, open_logs, start_tracking, write_logs
 from ppo_utils.processes import all_gather, join_processes, leave_processes, rank_and_size, seed_generators
 from ppo_utils.run import Run
+from ppo_utils.terminal import one_line_exit, open_streams
 from ppo_utils.video import LaneVideo, check_can_film, check_draws
 
 T = TypeVar("T")  # a script's Args
@@ -306,7 +308,8 @@ def run_to_end(args: RunArgs, run: Run, train: Callable[[Any, Run], None]) -> Pa
         finally:
             close(run)
     if run.writer is not None:
-        print(summary(args, run))
+        with contextlib.suppress(OSError):  # nobody reads it
+            print(summary(args, run))
     if interrupt is not None:
         raise interrupt
     return run.folder
@@ -353,24 +356,24 @@ def command(
     kind: type[T], presets: dict[str, dict[str, Any]], setup: Callable[[T], Run], train: Callable[[T, Run], None]
 ) -> None:
     """Train as the command line says, and exit: with one line for an error that a user can correct."""
-
-    def fail(error: Exception) -> NoReturn:
-        sys.exit(f"{Path(sys.argv[0]).name}: {' '.join(str(error).split())}")
-
-    try:
+    open_streams()
+    publish(setup.__globals__)
+    with one_line_exit(ValueError, OSError, ImportError, gym.error.Error, RunError):
         args = parse_args(kind, presets, sys.argv[1:])
         run = setup(args)
-    except (ValueError, OSError, ImportError, gym.error.Error, RunError) as error:
-        fail(error)
-    except KeyboardInterrupt:
-        sys.exit(130)
     stop_on_signals(run)
     # If TensorBoard's thread fails to write, the next call to the writer raises here.
     threading.excepthook = lambda it: None if "tensorboard" in repr(type(it.thread)) else threading.__excepthook__(it)
-    try:
+    with one_line_exit(FloatingPointError, RunError):
         run_to_end(args, run, train)
-    except (FloatingPointError, RunError) as error:
-        fail(error)
-    except KeyboardInterrupt:
-        sys.exit(130)
     sys.exit(128 + run.received_signal if run.received_signal else 0)
+
+
+def publish(namespace: dict[str, Any]) -> None:
+    """Let the names of a script that runs as `__main__` be found there, where its flags' types are looked up.
+
+    What executes a script's text, as `python -m cProfile` does before Python 3.12, has a `__main__` of its own.
+    """
+    if namespace["__name__"] == "__main__" and vars(sys.modules["__main__"]) is not namespace:
+        sys.modules["__main__"] = ModuleType("__main__")
+        vars(sys.modules["__main__"]).update(namespace)

@@ -1,7 +1,6 @@
 """Videos of the first environment while an agent trains."""
 
 import importlib
-import sys
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from memory_gym_envs.options import brief
 from memory_gym_envs.saving import Saved
 from ppo_utils.environments import find_spec
 from ppo_utils.lanes import creator
+from ppo_utils.terminal import tell
 
 MAX_VIDEO_FRAMES = 1000
 
@@ -79,7 +79,7 @@ class LaneVideo(Saved, VectorWrapper):
         except Exception as error:  # of the environment, ffmpeg or the disk
             self._end()
             what = " ".join(str(error).split()) or repr(error)
-            print(f"the video of episode {self.episode} ends after {self.frames} frames: {what}", file=sys.stderr)
+            tell(f"the video of episode {self.episode} ends after {self.frames} frames: {what}")
 
     def _end(self) -> None:
         writer, self.writer, self.recording = self.writer, None, False
