@@ -25,6 +25,7 @@ class Run:
     device: torch.device
     checkpoint: dict[str, Any] | None  # that --resume goes on from
     envs: gym.vector.VectorEnv
+    started_in: Path  # the folder
     agent: nn.Module | None = None
     optimizers: list[torch.optim.Optimizer] = field(default_factory=list)
     carry: Any = None  # a script's Carry, what the next rollout goes on with

@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from itertools import count
 from pathlib import Path
 from types import ModuleType
@@ -79,6 +79,7 @@ def prepare(args: RunArgs, script: str) -> tuple[Run, dict[str, np.ndarray], dic
     Returns the run, which a script completes, the first observations and infos. Raises ValueError, OSError,
     ImportError, RunError or gymnasium.error.Error, each with one line for the user.
     """
+    started_in = Path.cwd()  # environments may change it when they are made, or later
     if not re.fullmatch(SCRIPT_NAME, script):
         raise ValueError(
             f"the script {script}.py must be named ppo_NAME.py, in letters, digits and _, to be found again"
@@ -100,7 +101,7 @@ def prepare(args: RunArgs, script: str) -> tuple[Run, dict[str, np.ndarray], dic
         envs = training_envs(args, checkpoint)
     with report_out_of_memory(args, device, envs.single_observation_space):
         obs, infos = envs.reset()
-    return Run(script, device, checkpoint, envs), obs, infos
+    return Run(script, device, checkpoint, envs, started_in), obs, infos
 
 
 def seed_process(args: RunArgs, checkpoint: dict[str, Any] | None) -> None:
@@ -157,7 +158,8 @@ def open_run(args: RunArgs, run: Run) -> Run:
     if rank > 0:  # all processes began with the same weights, but draw actions of their own
         torch.manual_seed(int(np.random.SeedSequence([args.seed, rank]).generate_state(1)[0]))
     if args.load_model is not None and checkpoint is None:
-        load_model(args, run.agent, run.script)
+        path = args.load_model if Path.cwd() == run.started_in else run.started_in / args.load_model
+        load_model(replace(args, load_model=path), run.agent, run.script)
     if checkpoint is not None:
         load_learner(run, checkpoint, args.resume)
     if rank == 0:
@@ -176,7 +178,7 @@ def open_folder(args: RunArgs, run: Run) -> None:
 
     Raises OSError if it cannot be written or is in use, or as `start_tracking` does.
     """
-    run.folder = make_folder(args) if args.resume is None else Path(args.resume)
+    run.folder = make_folder(args, run.started_in) if args.resume is None else run.started_in / args.resume
     if not os.access(run.folder, os.W_OK):
         raise OSError(f"--resume {run.folder}: this folder cannot be written")
     run.lock = (run.folder / ".lock").open("w")
@@ -195,7 +197,9 @@ def open_folder(args: RunArgs, run: Run) -> None:
             if args.resume is None:
                 run.lock.close()  # Windows removes no file that is open
                 (run.folder / ".lock").unlink()
-                os.removedirs(run.folder)
+                run.folder.rmdir()
+                with contextlib.suppress(OSError):  # there are other runs
+                    run.folder.parent.rmdir()
             raise
     for part in run.folder.glob("*.part"):
         part.unlink()  # of a process that was killed while it wrote
@@ -203,10 +207,11 @@ def open_folder(args: RunArgs, run: Run) -> None:
         run.envs = LaneVideo(run.envs, str(run.folder / (f"videos-{run.step}" if run.step else "videos")))
 
 
-def make_folder(args: RunArgs) -> Path:
+def make_folder(args: RunArgs, started_in: Path) -> Path:
     """Make a run folder; runs of the same name that begin in the same second get a number. Raises OSError."""
     name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
-    first = Path("runs") / re.sub(r'[<>:"/\\|?*\x00-\x1f]', "-", name)  # what a name may not have in Windows
+    name = re.sub(r'[<>:"/\\|?*\x00-\x1f]', "-", name)  # what a name may not have in Windows
+    first = started_in / "runs" / name
     for number in count(1):
         folder = first if number == 1 else first.with_name(f"{first.name}-{number}")
         try:
@@ -322,7 +327,7 @@ def summary(args: RunArgs, run: Run) -> str:
         score = f"return {run.scores['return'].mean():.2f} on {args.eval_levels} unseen levels"
     elif run.returns:
         score = f"return {np.mean(run.returns):.2f}, mean of the last {len(run.returns)} episodes"
-    folder = shlex.quote(run.folder.as_posix())  # with slashes, which need no quotes, in Windows too
+    folder = shlex.quote(shown(run.folder, run.started_in))
     # A wheel has these modules in this package, and the scripts at top level.
     installed = Path(__file__).with_name("evaluate.py").exists()
     evaluate, enjoy = ("-m ppo_utils.evaluate", "-m ppo_utils.enjoy") if installed else ("evaluate.py", "enjoy.py")
@@ -330,17 +335,23 @@ def summary(args: RunArgs, run: Run) -> str:
     lacking = not all(map(importlib.util.find_spec, ("PIL", "plotly")))  # which enjoy.py needs
     extra = "memory-gym-baselines[eval]" if installed else '-e ".[eval]"'
     install = f"pip install {extra} && " if lacking else ""
-    lines = [f"{run.folder}: {run.step:,} steps, {score}"]
+    lines = [f"{shown(run.folder, run.started_in)}: {run.step:,} steps, {score}"]
     checkpoints = checkpoints_in(run.folder)[-1:]
     if run.stop and checkpoints:
         lines.append(f"resume: python {script} --resume {folder}")
     for path in [run.folder / "model.pt"] if args.save_model else checkpoints:
-        model = shlex.quote(path.as_posix())
+        model = shlex.quote(shown(path, run.started_in))
         lines.append(f"evaluate: python {evaluate} {model}")
         with contextlib.suppress(ValueError):
             check_draws("enjoy.py", args.env_id)
             lines.append(f"watch: {install}python {enjoy} {model} --out page.html")
     return "\n".join([*lines, f"plot: tensorboard --logdir {folder}"])
+
+
+def shown(path: Path, started_in: Path) -> str:
+    """Return a path with slashes, from the folder that the training was started in if it is below that."""
+    path = path.relative_to(started_in) if path.is_relative_to(started_in) else path
+    return path.as_posix()  # backslashes would be quoted in Windows
 
 
 def close(run: Run) -> None:

@@ -225,6 +225,35 @@ def test_environments_of_other_packages_begin_new_episodes(tiny, opened, curves,
     assert [step for step, _ in curves(folder)["losses/loss"]] == [64, 128, 192, 256, 320]
 
 
+@pytest.mark.parametrize("when", ["made", "stepped"])
+def test_an_environment_that_changes_the_folder(tiny, tmp_path, monkeypatch, capsys, when):
+    """A run, one that goes on, and one with loaded weights, all named from where they were started."""
+
+    class Away(type(gym.make("CueRecall-v0").unwrapped)):
+        def __init__(self):
+            if when == "made":
+                os.chdir("/")
+
+        def step(self, action):
+            os.chdir("/")
+            return super().step(action)
+
+    gym.register("Away-v0", Away)
+    args = tiny(env_id="Away-v0", checkpoint_interval=1, save_model=True)
+    (folder,) = {ppo_gru.main(args)}
+    assert folder.parent == tmp_path / "runs"
+    assert {"model.pt", "checkpoint-64.pt", "checkpoint-128.pt"} < {*os.listdir(folder)}
+    assert f"evaluate: python evaluate.py runs/{folder.name}/model.pt" in capsys.readouterr().out
+    for flags in (
+        {"resume": f"runs/{folder.name}", "total_timesteps": 192},
+        {"load_model": f"runs/{folder.name}/model.pt"},
+    ):
+        monkeypatch.chdir(tmp_path)
+        assert ppo_gru.main(dataclasses.replace(args, **flags)).parent == tmp_path / "runs"
+    assert (folder / "checkpoint-192.pt").is_file()
+    assert len(os.listdir(tmp_path / "runs")) == 2
+
+
 @pytest.mark.parametrize("draw", [np.random.rand, random.random])
 def test_episodes_drawn_from_a_global_generator_are_not_repeated(tiny, opened, monkeypatch, draw):
     class Drawn(type(gym.make("CueRecall-v0").unwrapped)):

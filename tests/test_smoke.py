@@ -416,7 +416,7 @@ def test_a_run_that_is_extended_keeps_its_schedule(monkeypatch):
 def test_the_last_lines(tiny, capsys, monkeypatch):
     """The folder with the score, and the commands that evaluate, watch and plot."""
     args = tiny(env_id="MortarMayhemB-Grid-v0", total_timesteps=256, num_steps=64)
-    folder = ppo_gru.main(args)
+    folder = ppo_gru.main(args).relative_to(os.getcwd())
     score, *commands = capsys.readouterr().out.splitlines()
     assert re.fullmatch(rf"{folder}: 256 steps, return -?\d\.\d\d, mean of the last \d+ episodes", score)
     checkpoint = folder / "checkpoint-256.pt"
@@ -428,11 +428,12 @@ def test_the_last_lines(tiny, capsys, monkeypatch):
     find_spec = runs.importlib.util.find_spec
     monkeypatch.setattr(runs.importlib.util, "find_spec", lambda name: None if name == "plotly" else find_spec(name))
     folder = ppo_gru.main(dataclasses.replace(args, eval_interval=1, eval_levels=2, save_model=True, exp_name="b"))
+    folder = folder.relative_to(os.getcwd())
     score, *commands = capsys.readouterr().out.splitlines()
     assert re.fullmatch(rf"{folder}: 256 steps, return -?\d\.\d\d on 2 unseen levels", score)
     assert commands[0] == f"evaluate: python evaluate.py {folder / 'model.pt'}"
     assert commands[1].startswith('watch: pip install -e ".[eval]" && python enjoy.py')
-    folder = ppo_gru.main(tiny(env_id="MysteryPath-v0", checkpoint_interval=0, exp_name="c d"))
+    folder = ppo_gru.main(tiny(env_id="MysteryPath-v0", checkpoint_interval=0, exp_name="c d")).relative_to(os.getcwd())
     told = [f"{folder}: 128 steps, no episode ended", f"plot: tensorboard --logdir '{folder}'"]
     assert capsys.readouterr().out.splitlines() == told
 
@@ -443,10 +444,11 @@ def test_the_last_lines_of_a_run_that_was_stopped(tiny, opened, capsys):
     run.received_signal = 15
     runs.run_to_end(args, run, ppo_gru.train)
     told = capsys.readouterr().out.splitlines()
+    folder = run.folder.relative_to(os.getcwd())
     assert told[1:] == [
-        f"resume: python ppo_gru.py --resume {run.folder}",
-        f"evaluate: python evaluate.py {run.folder / 'checkpoint-64.pt'}",  # this environment draws nothing to watch
-        f"plot: tensorboard --logdir {run.folder}",
+        f"resume: python ppo_gru.py --resume {folder}",
+        f"evaluate: python evaluate.py {folder / 'checkpoint-64.pt'}",  # this environment draws nothing to watch
+        f"plot: tensorboard --logdir {folder}",
     ]
 
 
