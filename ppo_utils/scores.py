@@ -21,7 +21,7 @@ OWN_METRIC = {
     "Endless-SearingSpotlights": "coins_collected",
 }
 # Arguments that say how a run was started and recorded, not what learned.
-BOOKKEEPING = {"preset", "seed", "torch_deterministic", "cuda", "track", "capture_video", "save_model", "resume"}
+BOOKKEEPING = {"preset", "seed", "cuda", "track", "capture_video", "save_model", "resume"}
 BOOKKEEPING |= {"checkpoint_interval", "eval_interval", "eval_levels", "eval_max_steps", "async_envs"}
 RESAMPLES = 2000
 

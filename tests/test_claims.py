@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.stats
+from tqdm import tqdm
 
 import claims
 import learning
+import ppo_gru
 import suites
 import tables
 from ppo_utils.run_logs import RunLog
@@ -142,9 +144,20 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     agents = {name: f"{flags} {small}" for name, flags in suites.AGENTS.items()}
     monkeypatch.setattr(learning, "AGENTS", agents)
     config = claims.Config(
-        claims=("normalized-gradients",), steps=64, seeds=(1, 2), evaluations=1, folder=tmp_path / "runs"
+        claims=("normalized-gradients",), steps=64, seeds=(1, 2), jobs=1, evaluations=1, folder=tmp_path / "learning"
     )
-    config.results, config.test_levels = tmp_path / "results", 2
+    config.results = tmp_path / "results"
+
+    def train(config, plan):  # in this process
+        monkeypatch.chdir(config.folder)
+        ppo_gru.main(plan.args)
+        tqdm.write(f"trained {plan}")
+
+    monkeypatch.setattr(learning, "train", train)
+    tested = np.ones((1, 2, 1))
+    monkeypatch.setattr(
+        learning, "test_scores", lambda config, plan, run: {f"test/{plan.task.score}": ([run.last_step], tested)}
+    )
     claims.main(config)
     told = capsys.readouterr().out
     assert told.count("trained GRU") == 4

@@ -209,7 +209,6 @@ def test_the_same_step_twice_is_refused():
     "name",
     [
         "preset",
-        "torch_deterministic",
         "cuda",
         "async_envs",
         "track",

@@ -11,10 +11,16 @@ import window_probe
 TASK = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector", "save_model": True}
 
 
-def test_rows_of_the_windows(tiny, monkeypatch, capsys):
-    folder = ppo_trxl.main(tiny(ppo_trxl, **TASK))
-    capsys.readouterr()
-    monkeypatch.chdir(folder)
+@pytest.fixture(scope="module")
+def trained(tiny, tmp_path_factory):
+    """The run folders of an agent of each script."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("trained"))
+        return {script: script.main(tiny(script, **TASK)).resolve() for script in (ppo_gru, ppo_trxl)}
+
+
+def test_rows_of_the_windows(trained, monkeypatch, capsys):
+    monkeypatch.chdir(trained[ppo_trxl])
     play, windows = evaluate.play, []
 
     def spy(checkpoint, config):
@@ -45,7 +51,6 @@ def test_rows_of_the_windows(tiny, monkeypatch, capsys):
         (ppo_trxl, {"windows": (4,), "max_steps": 2}, "with a window of 4, --max-steps 2 cut episodes short"),
     ],
 )
-def test_what_cannot_be_played(tiny, script, changes, told):
-    folder = script.main(tiny(script, **TASK))
+def test_what_cannot_be_played(trained, script, changes, told):
     with pytest.raises(ValueError, match=told):
-        window_probe.main(window_probe.Config(f"{folder}/model.pt", levels=2, repeats=1, **changes))
+        window_probe.main(window_probe.Config(f"{trained[script]}/model.pt", levels=2, repeats=1, **changes))
