@@ -106,7 +106,7 @@ def table(agents: list[dict[str, Any]]) -> str:
                 cells += [f"{score[f'iqm{suffix}']:.3f}"]
                 cells += ["" if ends is None else "{:.3f} to {:.3f}".format(*ends)] * has_intervals
             lines.append(f"| {' | '.join(map(str, cells))} |")
-    if any(len(agent["runs"]) == 1 for agent in agents):
+    if any("±" in line for line in lines):
         lines.append("\n± of one seed is the standard error over levels; other seeds would differ by more")
     for agent in agents:
         if len({*agent["steps"]}) > 1:
