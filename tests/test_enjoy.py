@@ -299,12 +299,12 @@ def test_what_the_ground_truth_is_called(env_id, seed):
 
 def test_what_sets_agents_apart(tiny):
     """Two transformers have other names if their attention differs."""
-    changes = [{}, {"trxl_positional_encoding": "none"}, {"trxl_query_output": True}, {"trxl_layer_norm": "post"}]
+    changes = [{}, {"trxl_positional_encoding": "none"}, {"trxl_layer_norm": "post"}]
     changes += [{"trxl_memory_length": 8}, {"trxl_num_heads": 4}, {"frame_stack": 4}, {"trxl_gate": "gru"}]
     names = [enjoy.memory_of(tiny(ppo_trxl, **change)) for change in changes]
     assert names[1] == "TrXL, 2 blocks, 2 heads, width 32, window 7, no positional encoding, pre-norm"
-    assert names[2].endswith("absolute positional encoding, pre-norm, query output")
-    assert names[6].endswith("pre-norm, frame stack 4")
+    assert names[2].endswith("absolute positional encoding, post-norm")
+    assert names[5].endswith("pre-norm, frame stack 4")
     assert len({*names}) == len(names)
     assert enjoy.memory_of(tiny(ppo_trxl, trxl_num_layers=1)).startswith("TrXL, 1 block, ")
 
@@ -427,6 +427,7 @@ def odd(saved):
     gym.registry.pop("Odd-v0", None)
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # Gymnasium's checks of the same
 @pytest.mark.parametrize("frame", ["floats", "gray", "list"])
 def test_pictures_of_every_kind(frame, odd):
     odd(frame=frame)
@@ -436,6 +437,7 @@ def test_pictures_of_every_kind(frame, odd):
     assert page["options"] == {"frame": frame}
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
 def test_no_pictures(odd):
     odd()
     with pytest.raises(ValueError, match=r"Odd-v0 draws no images \(render_mode rgb_array\)"):
