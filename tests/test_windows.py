@@ -397,6 +397,15 @@ def test_episodes_longer_than_a_learned_encoding(encoding):
             assert take_step(memory, state, torch.randn(1, WIDTH).double()).isfinite().all()
 
 
+@pytest.mark.parametrize("step", [0, 1023, 1024, 1025, 5000])
+def test_the_table_of_sinusoids_grows_to_the_steps_that_are_met(step):
+    memory = make_memory()
+    for step_now in (step, step + 1):  # an episode goes on
+        at = memory.position(torch.tensor([step_now]), torch.zeros((), dtype=torch.float64))
+        assert at.equal(sinusoid(torch.tensor([step_now]), WIDTH))
+    assert "sinusoids" not in memory.state_dict()
+
+
 def test_sinusoid():
     at = sinusoid(torch.tensor([0, 1, 5000]), 4)
     assert at[0].tolist() == [0, 1, 0, 1]
