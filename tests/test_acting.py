@@ -124,3 +124,22 @@ def test_a_step_is_exported_as_documented(trained, script, changes, monkeypatch)
             agent.memory.reset(memory, torch.tensor([True]))
             state = names["beginning"]
     assert Path("step.pt2").exists()
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_most_probable_actions(played, script):
+    """Of each branch, with their log-probabilities; the memory moves on as it does with sampled ones."""
+    _, run, *_ = played(script=script, env_id="MysteryPath-v0", weights_scale=3.0)
+    agent, fresh = run.agent, run.agent.memory.initial(4, torch.device("cpu"))
+    obs = {name: part[0] for name, part in run.rollout.obs.items()}
+    states = [agent.memory.begin_rollout(fresh, 2) for _ in range(2)]
+    with torch.no_grad():
+        policy, values, _ = agent.heads(agent.memory.step(states[0], agent.encoder(obs))[0])
+        actions, log_probs, found = agent.get_action_and_value(obs, states[0], deterministic=True)
+        agent.get_action_and_value(obs, states[1])
+    wanted = [branch.logits.max(-1) for branch in policy]
+    assert actions.equal(torch.stack([each.indices for each in wanted], -1))
+    assert log_probs.equal(torch.stack([each.values for each in wanted], -1))
+    assert found.equal(values)
+    for name, part in agent.memory.carry(states[0]).items():
+        assert part.equal(agent.memory.carry(states[1])[name])
