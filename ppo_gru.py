@@ -372,9 +372,10 @@ def clip_gradients(agent: Agent, args: Args) -> Tensor:
     With --auxiliary-detach, each auxiliary head is clipped by itself, so that it does not change the agent's step.
     """
     parameters = {*agent.parameters()}
-    for head in agent.auxiliary_heads() if args.auxiliary_detach else ():
-        nn.utils.clip_grad_norm_(head.parameters(), args.max_grad_norm)
-        parameters -= {*head.parameters()}
+    for head in [getattr(agent, name) for name in agent.auxiliary] if args.auxiliary_detach else ():
+        if head is not None:
+            nn.utils.clip_grad_norm_(head.parameters(), args.max_grad_norm)
+            parameters -= {*head.parameters()}
     return nn.utils.clip_grad_norm_([each for each in agent.parameters() if each in parameters], args.max_grad_norm)
 
 
@@ -744,6 +745,8 @@ class Agent(nn.Module):
     ValueError for an observation that does not suit the arguments.
     """
 
+    auxiliary = ("decoder", "estimator")  # networks that neither act nor value, None where they are off
+
     def __init__(self, space: gym.spaces.Dict, nvec: list[int], args: Args, ground_truth_size: int = 0):
         super().__init__()
         self.encoder = Encoder(space.spaces, Memory.input_width(args) if args.embedding else None)
@@ -755,10 +758,6 @@ class Agent(nn.Module):
         with torch.random.fork_rng(devices=[]):  # they do not change the random numbers that are drawn later
             self.decoder = Decoder(args.trunk_size, images[0]) if args.reconstruction_coef else None
             self.estimator = mlp_head(args.trunk_size, ground_truth_size, 1.0) if args.ground_truth_coef else None
-
-    def auxiliary_heads(self) -> list[nn.Module]:
-        """Return the networks that neither act nor value: decoder and estimator, as far as there are any."""
-        return [head for head in (self.decoder, self.estimator) if head is not None]
 
     def get_action_and_value(
         self, obs: dict[str, Tensor], state: MemoryState, deterministic: bool = False

@@ -29,6 +29,7 @@ from ppo_utils.flags import RunArgs, as_flags, flag
 from ppo_utils.processes import all_gather, rank_and_size
 from ppo_utils.run import Run
 from ppo_utils.terminal import tell
+from ppo_utils.wrappers import WRAPPERS
 
 T = TypeVar("T")  # a script's Args
 # Names that flags and weights have in older files.
@@ -195,11 +196,11 @@ def load_weights(agent: nn.Module, saved: dict[str, Any], path: str | Path) -> N
     """
     try:
         missing, unexpected = agent.load_state_dict(saved["weights"], strict=False)
-        if not all(name.startswith(("decoder.", "estimator.")) for name in (*missing, *unexpected)):
+        if not {name.partition(".")[0] for name in (*missing, *unexpected)} <= {*agent.auxiliary}:
             raise RuntimeError
     except (RuntimeError, TypeError):
-        names = ("env_id", "obs_type", "frame_stack", "step_encoding", "observe_last_action", "vector_frequencies")
-        theirs = {name: saved["args"][name] for name in (*names, "embedding", "trunk_size") if name in saved["args"]}
+        names = ("env_id", "obs_type", *WRAPPERS, "embedding", "trunk_size")
+        theirs = {name: saved["args"][name] for name in names if name in saved["args"]}
         raise ValueError(f"{path} holds the weights of another network, trained with {as_flags(theirs)}") from None
     if not all(weight.isfinite().all() for weight in saved["weights"].values()):
         raise ValueError(f"{path} holds weights that are not finite: the training diverged")

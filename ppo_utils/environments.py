@@ -27,20 +27,12 @@ import memory_gym_envs  # noqa: F401 (registers its ids)
 from memory_gym_envs.base import MemoryGymVectorEnv, checked_integer
 from memory_gym_envs.options import brief
 from memory_gym_envs.saving import Saved
-from ppo_utils.flags import RunArgs
+from ppo_utils.flags import RunArgs, flag
 from ppo_utils.lanes import Levels, creator, one_line, one_line_errors, same_step_envs
 from ppo_utils.observations import ObservationParts
 from ppo_utils.processes import rank_and_size
 from ppo_utils.terminal import tell
-from ppo_utils.wrappers import (
-    FourierFeatures,
-    GrayscaleStack,
-    LastAction,
-    SpotlightPerturbation,
-    StepEncoding,
-    VectorStack,
-    branch_sizes,
-)
+from ppo_utils.wrappers import WRAPPERS, branch_sizes
 
 T = TypeVar("T")  # a script's Args
 
@@ -54,9 +46,8 @@ def envs_for(args: RunArgs, num_envs: int, **kwargs: Any) -> VectorEnv:
 
 
 def wrappers_of(args: RunArgs) -> dict[str, Any]:
-    """Return the arguments of `wrap_envs` that are among a script's."""
-    names = ("frame_stack", "step_encoding", "observe_last_action", "spotlight_perturbation", "vector_frequencies")
-    return {name: getattr(args, name) for name in names}
+    """Return the flags of `wrap_envs` that are among a script's arguments."""
+    return {name: getattr(args, name) for name in WRAPPERS}
 
 
 def training_envs(args: RunArgs, checkpoint: dict[str, Any] | None) -> VectorEnv:
@@ -104,7 +95,7 @@ def make_envs(
         environments.
     obs_type: of Memory Gym environments; others ignore it, with a line on stderr if they show images.
     render_mode: what render() draws; of other packages than this, always rgb_array.
-    wrappers: arguments of `wrap_envs`.
+    wrappers: flags of `wrap_envs`.
 
     Observations and actions are those of `wrap_envs`; infos hold the statistics of ended episodes, see Gymnasium's
     vector RecordEpisodeStatistics.
@@ -151,38 +142,21 @@ def make_envs(
         raise
 
 
-def wrap_envs(
-    envs: VectorEnv,
-    first_lane: int = 0,
-    *,
-    frame_stack: int = 0,
-    step_encoding: bool = False,
-    observe_last_action: bool = False,
-    spotlight_perturbation: bool = False,
-    vector_frequencies: int = 0,
-) -> VectorEnv:
+def wrap_envs(envs: VectorEnv, first_lane: int = 0, **flags: Any) -> VectorEnv:
     """Wrap a vector environment with same-step autoreset, so that agents can observe it and act in it.
 
     Observations are dicts of images and vectors, see `ObservationParts`; actions are integers (N, A), see
-    `branch_actions`. first_lane: number of the first environment, for error messages. All else: see GrayscaleStack and
-    VectorStack, StepEncoding, LastAction, SpotlightPerturbation, FourierFeatures. Raises ValueError for an environment
-    that does not suit.
+    `branch_actions`. first_lane: number of the first environment, for error messages. flags: values by name, of those
+    in WRAPPERS; what is 0 or False adds nothing. Raises ValueError for an environment that does not suit, TypeError for
+    other flags.
     """
+    if unknown := [name for name in flags if name not in WRAPPERS]:
+        raise TypeError(f"there is no argument {unknown[0]}; there are {', '.join(WRAPPERS)}")
     envs = ObservationParts(branch_actions(envs), first_lane)
-    if spotlight_perturbation:
-        with one_line_errors("--spotlight-perturbation"):
-            envs = SpotlightPerturbation(envs)
-    if frame_stack:
-        images = any(len(part.shape) == 3 for part in envs.single_observation_space.values())
-        with one_line_errors("--frame-stack"):
-            envs = (GrayscaleStack if images else VectorStack)(envs, frame_stack)
-    if step_encoding:
-        envs = StepEncoding(envs)
-    if observe_last_action:
-        envs = LastAction(envs)
-    if vector_frequencies:
-        with one_line_errors("--vector-frequencies"):
-            envs = FourierFeatures(envs, vector_frequencies)
+    for name, wrap in WRAPPERS.items():
+        if flags.get(name):
+            with one_line_errors(flag(name)):
+                envs = wrap(envs, flags[name])
     return envs
 
 

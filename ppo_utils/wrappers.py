@@ -441,3 +441,19 @@ def _batched(observations: np.ndarray) -> Any:
     if isinstance(observations[0], dict):
         return {key: np.stack([each[key] for each in observations]) for key in observations[0]}
     return np.stack(list(observations))
+
+
+def stacked(envs: VectorEnv, frames: int) -> VectorEnv:
+    """Stack images, or vectors where there are no images."""
+    images = any(len(part.shape) == 3 for part in envs.single_observation_space.values())
+    return (GrayscaleStack if images else VectorStack)(envs, frames)
+
+
+# What flags of RunArgs do to observations, the innermost first: each takes the environments and the flag's value.
+WRAPPERS = {
+    "spotlight_perturbation": lambda envs, _: SpotlightPerturbation(envs),
+    "frame_stack": stacked,
+    "step_encoding": lambda envs, _: StepEncoding(envs),
+    "observe_last_action": lambda envs, _: LastAction(envs),
+    "vector_frequencies": FourierFeatures,
+}
