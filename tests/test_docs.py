@@ -130,7 +130,7 @@ def all_flags() -> set[str]:
     found = set()
     for path in PROGRAMS:
         source = path.read_text()
-        if any(part in source for part in ("tyro.cli(", "ArgumentParser(", "class Args:")):
+        if any(part in source for part in ("tyro.cli(", "ArgumentParser(", "class Args(")):
             with patch.dict(os.environ, COLUMNS="200"):
                 text = error(parser(import_program(str(path))), ["--help"])
             for line in re.findall(r"^[\s│]*((?:-\w, )?--\S.*)$", text, re.MULTILINE):
