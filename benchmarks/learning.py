@@ -140,9 +140,17 @@ def check(config: Training) -> None:
 
 @functools.cache
 def parse(script: str, *flags: str) -> Any:
-    """Return what a script's flags stand for; tyro takes a tenth of a second, so that seeds and claims share it."""
+    """Return what a script's flags stand for, checked. That takes a tenth of a second, which seeds and claims share.
+
+    Raises ValueError or OSError for what the script refuses.
+    """
     module = importlib.import_module(Path(script).stem)
-    return parse_args(module.Args, module.PRESETS, [*flags])
+    args = parse_args(module.Args, module.PRESETS, [*flags])
+    check_args(args)
+    with torch.device("meta"):  # its weights are not needed, and take longer than all else
+        memory = module.Memory(args, module.Memory.input_width(args))
+    check_minibatches(args, memory)
+    return args
 
 
 def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
@@ -165,11 +173,9 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
         flags += [f"--{each.replace('_', '-')}", str(value)]
     flags += f"{dashes}{further}".split()
     try:
-        module = importlib.import_module(Path(script).stem)
         parsed = parse(script, *flags)
         args = replace(parsed, seed=seed)
         check_args(args)
-        check_minibatches(args, module.Memory(args, module.Memory.input_width(args)))
     except (ValueError, OSError) as error:
         raise SystemExit(f"{agent}: {error}") from None
     theirs = {each: getattr(args, each) for each in of_the_suite}
