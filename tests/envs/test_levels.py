@@ -38,6 +38,23 @@ def test_generator_is_gymnasiums(env_id):
     check_same(observation, env.reset(seed=4)[0])
 
 
+def test_a_generator_from_outside():
+    """A lane draws from it from the next reset on. Its seed is -1, Gymnasium's word for one that is not known."""
+    envs = make("MysteryPath-v0")
+    envs.reset(seed=5)
+    fresh, _ = gym.utils.seeding.np_random(20)
+    envs.set_generator(2, fresh)
+    assert envs.np_random[2] is fresh
+    assert envs.np_random_seed == (5, 6, -1, 8)
+    _, infos = envs.reset(options={"show_goal": True, "reset_mask": np.arange(LANES) == 2})
+    alone = gym.make("MysteryPath-v0")
+    assert np.array_equal(infos["ground_truth"][2], alone.reset(seed=20)[1]["ground_truth"])
+    assert envs.np_random[2].bit_generator.state == alone.unwrapped.np_random.bit_generator.state
+    env = alone.unwrapped
+    env._np_random = np.random.default_rng(1)  # as Gymnasium's own setter does it
+    assert env.np_random_seed == -1
+
+
 @EACH
 def test_nothing_draws_from_a_global_generator(env_id):
     random.seed(1)

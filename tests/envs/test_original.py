@@ -1,6 +1,7 @@
 """What memory-gym 1.0.2 does where no recording leads. The expected values are what it gave."""
 
 import copy
+import json
 import math
 import zlib
 
@@ -8,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from helpers import EACH, check_same, roll
+from players import stumbling
 
 import fuzz_original
 from memory_gym_envs import IDS
@@ -99,6 +101,177 @@ def test_attributes_of_the_original(env_id):
     assert env.reset_params == env.default_reset_parameters | {"agent_scale": 0.3}
     env.default_reset_parameters["agent_scale"] = env.reset_params["agent_scale"] = 1.0
     assert (env.default_reset_parameters["agent_scale"], env.reset_params["agent_scale"]) == (0.25, 0.3)
+
+
+# Options that are rarely met together: id, level, how often the player stumbles, options, checksum of what they gave.
+EPISODES = [
+    (
+        "MortarMayhem-v0",
+        1,
+        0.0,
+        {"reward_command_success": 0.0, "reward_episode_success": 0.5, "command_count": [2]},
+        2454724946,
+    ),
+    (
+        "MortarMayhem-Grid-v0",
+        2,
+        0.0,
+        {"reward_command_success": -1.0, "reward_episode_success": 0.5, "command_show_delay": [0]},
+        2517202689,
+    ),
+    ("MortarMayhemB-v0", 3, 0.1, {"arena_size": 2, "agent_scale": 0.9, "visual_feedback": False}, 3860761588),
+    ("Endless-MortarMayhem-v0", 2, 0.0, {"agent_scale": 0.2, "agent_speed": 5.5}, 4243898724),
+    (
+        "Endless-MortarMayhem-v0",
+        5,
+        0.0,
+        {"agent_scale": 0.6, "allowed_commands": 4, "initial_command_count": 3},
+        1323787362,
+    ),
+    (
+        "MysteryPath-v0",
+        6,
+        0.1,
+        {"show_origin": True, "show_goal": True, "agent_scale": 0.4, "agent_speed": 2.5},
+        1776970569,
+    ),
+    (
+        "MysteryPath-Grid-v0",
+        7,
+        0.2,
+        {"show_goal": True, "reward_path_progress": 0.1, "visual_feedback": False},
+        1206388327,
+    ),
+    (
+        "Endless-MysteryPath-v0",
+        8,
+        0.1,
+        {"agent_speed": 5.0, "show_background": True, "camera_offset_scale": 2.3},
+        627045775,
+    ),
+    ("Endless-MysteryPath-v0", 9, 0.1, {"agent_speed": 7.0, "show_background": True, "show_stamina": True}, 1921750883),
+    ("Endless-MysteryPath-v0", 10, 0.3, {"camera_offset_scale": 0.375}, 3930608191),
+    ("Endless-MysteryPath-v0", 11, 0.1, {"camera_offset_scale": 0.6, "agent_speed": 4.0}, 1824402223),
+    (
+        "Endless-MysteryPath-v0",
+        12,
+        0.1,
+        {"camera_offset_scale": 1.331, "agent_speed": 1.0, "stamina_level": 60},
+        2241310818,
+    ),
+    (
+        "Endless-MysteryPath-v0",
+        13,
+        0.3,
+        {"camera_offset_scale": 5.5, "agent_scale": 0.47, "show_stamina": True, "stamina_level": 40},
+        2666017023,
+    ),
+    (
+        "Endless-MysteryPath-v0",
+        14,
+        0.3,
+        {"camera_offset_scale": 5.5, "agent_scale": 0.7, "show_stamina": True},
+        1595137261,
+    ),
+    ("SearingSpotlights-v0", 7, 0.0, {"light_threshold": 84, "exit_scale": 0.55}, 2622199732),
+    (
+        "SearingSpotlights-v0",
+        14,
+        0.0,
+        {"num_coins": [3], "show_last_action": False, "sample_agent_position": False},
+        3499235925,
+    ),
+    (
+        "SearingSpotlights-v0",
+        15,
+        0.5,
+        {"black_background": True, "hide_chessboard": True, "initial_spawns": 12, "spot_damage": 0.0},
+        3376648562,
+    ),
+    (
+        "SearingSpotlights-v0",
+        16,
+        0.1,
+        {"agent_visible": True, "coins_visible": True, "agent_scale": 0.5, "num_coins": [3]},
+        3511682533,
+    ),
+    (
+        "SearingSpotlights-v0",
+        17,
+        0.1,
+        {
+            "agent_visible": True,
+            "exit_visible": True,
+            "agent_scale": 0.5,
+            "num_coins": [3],
+            "coin_scale": 2.0,
+            "exit_scale": 1.8,
+        },
+        1667542922,
+    ),
+    (
+        "SearingSpotlights-v0",
+        18,
+        0.1,
+        {
+            "agent_visible": True,
+            "exit_visible": True,
+            "coins_visible": True,
+            "num_coins": [3],
+            "coin_scale": 2.0,
+            "exit_scale": 1.8,
+        },
+        762693620,
+    ),
+    (
+        "SearingSpotlights-v0",
+        19,
+        0.1,
+        {"light_dim_off_duration": 255, "num_coins": [3], "coin_scale": 2.0, "exit_scale": 1.8},
+        1580612811,
+    ),
+    (
+        "SearingSpotlights-v0",
+        1,
+        0.9,
+        {
+            "spot_min_speed": 0.125,
+            "spot_max_speed": 0.125,
+            "initial_spawn_interval": 0,
+            "spawn_interval_threshold": 3,
+            "spot_damage": 0.1,
+        },
+        357530408,
+    ),
+    (
+        "Endless-SearingSpotlights-v0",
+        21,
+        0.1,
+        {"agent_visible": True, "coins_visible": True, "coin_scale": 1.5, "light_threshold": 84},
+        2364779080,
+    ),
+    (
+        "Endless-SearingSpotlights-v0",
+        22,
+        0.3,
+        {"agent_scale": 1.0, "spot_damage": 0.7, "show_last_positive_reward": False},
+        3330893509,
+    ),
+]
+
+
+@pytest.mark.parametrize(("env_id", "seed", "chance", "options", "expected"), EPISODES)
+def test_options_together(env_id, seed, chance, options, expected):
+    """Frames, rewards and the end of an episode, or its first 120 steps."""
+    env, rng = gym.make(env_id).unwrapped, np.random.default_rng(seed)
+
+    def act(step):
+        return stumbling(env.batch, rng, np.array([chance]))[0].tolist() if step < 120 else None
+
+    played = fuzz_original.play(env, seed, options, act, theirs=False)
+    seen = [checksums for _, *checksums in played["seen"]]
+    found = [seen, np.round(played["rewards"], 6).tolist(), played["over"]]
+    assert zlib.crc32(json.dumps(found).encode()) == expected
 
 
 # ---- benchmarks/fuzz_original.py ----

@@ -64,6 +64,21 @@ def test_a_limit_of_steps_is_a_truncation():
         assert (info["episode"]["l"], info["episode"]["r"]) == (20, 0.0)
 
 
+def test_an_end_at_the_limit_of_steps_is_no_truncation():
+    """An agent that stands still fails at a command; the limit is that very step."""
+    alone = gym.make("MortarMayhem-v0")
+    alone.reset(seed=0)
+    length = next(step for step in range(1, 300) if alone.step([0, 0])[2])
+    ours, theirs = both("MortarMayhem-v0", max_episode_steps=length)
+    for envs in (ours, theirs):
+        envs.seed(0)
+        envs.reset()
+        for _ in range(length):
+            _, _, done, infos = envs.step(np.zeros((LANES, 2), int))
+        assert done[0]
+        assert infos[0]["TimeLimit.truncated"] is False
+
+
 def test_options_are_those_of_all_lanes():
     envs = make("MysteryPath-v0", obs_type="vector")
     envs.set_options({"max_steps": 4})

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from players import player
 
+from memory_gym_envs.character import BODY, HAND_OUTLINE, PAD
 from memory_gym_envs.entries import vector_slices
 from memory_gym_envs.searing_spotlights import VARIANTS
 from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, RADIUS, REACH, SIGHT, SPEED, START, TIME
@@ -15,6 +16,7 @@ from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, RA
 FINITE, ENDLESS = "SearingSpotlights-v0", "Endless-SearingSpotlights-v0"
 SAFE = {"spot_damage": 0}
 DARK = {**SAFE, "initial_spawns": 0, "spawn_interval": 10**9, "light_dim_off_duration": 0}  # from the start to the end
+DARK_FINITE = {**SAFE, "initial_spawns": 0, "num_spawns": 0, "light_dim_off_duration": 0}
 STUCK = {"spot_min_speed": 0.0, "spot_max_speed": 0.0}  # spotlights stay where they start
 
 
@@ -329,10 +331,46 @@ def test_dimming():
         white.append(int(observation[4:].max()))
         observation, *_ = env.step([0, 0])
     assert white == [255, 213, 171, 129, 87, 45, 3, 0, 0, 0]
-    env.reset(seed=0, options={"light_threshold": 100, "initial_spawns": 0})
-    for _ in range(10):
-        observation, *_ = env.step([0, 0])
-    assert observation[4:].max() == 255 - 126  # the first step beyond the threshold
+    for threshold, last in ((83, 84), (84, 126), (100, 126)):  # the first step beyond the threshold
+        env.reset(seed=0, options={"light_threshold": threshold, "initial_spawns": 0})
+        for _ in range(10):
+            observation, *_ = env.step([0, 0])
+        assert observation[4:].max() == 255 - last
+
+
+@pytest.mark.parametrize(("scale", "radius"), [(0.5, 5), (0.55, 5.5), (1.25, 12.5)])
+def test_reach_of_the_exit(scale, radius):
+    """The agent's 6 pixels and ten times the scale, halves too; at its edge, and just beyond."""
+    env, _ = make(FINITE)
+    env.reset(seed=0, options={**SAFE, "exit_scale": scale, "num_coins": []})
+    env.step([0, 0])  # opens the exit
+    reaches = 0
+    for x, y in np.ndindex(20, 20):
+        near = x**2 + y**2 <= (6 + radius) ** 2
+        if abs(np.hypot(x, y) - 6 - radius) > 1:
+            continue
+        earlier = copy.deepcopy(env)
+        s = earlier.batch.state
+        s.bodies[:, 0, EXIT] = s.pos[0] - PAD + (x, -y)
+        _, reward, terminated, _, _ = earlier.step([0, 0])
+        assert (reward, terminated) == (float(near), near), (x, y)
+        reaches += near
+    assert reaches > 5
+
+
+@pytest.mark.parametrize("exit_visible", [False, True])
+@pytest.mark.parametrize("coins_visible", [False, True])
+def test_an_agent_that_shows_in_the_dark_is_below_the_bar_with_coins_and_exit_alone(coins_visible, exit_visible):
+    """As in the original, where it is drawn with the bar's surface unless both others are visible."""
+    env, _ = make(FINITE)
+    shown = {"agent_visible": True, "coins_visible": coins_visible, "exit_visible": exit_visible}
+    env.reset(seed=0, options={**DARK_FINITE, **shown, "agent_scale": 0.5, "num_coins": [0]})
+    s = env.batch.state
+    s.pos[0] = PAD + 30, PAD + 4 + 12  # as far up as it may walk: its hands reach into the bar
+    frame, *_ = env.step([0, 1])
+    hands = (frame[:4, 15:45] == HAND_OUTLINE).all(axis=-1).any()
+    assert (frame[4:] == BODY).all(axis=-1).any()
+    assert hands == (not (coins_visible and exit_visible))
 
 
 # ---- levels ----

@@ -219,6 +219,18 @@ def test_crosses_over_agents(env_id, scale):
     assert (frames < count) == (endless or (scale < 0.2 and "Grid" not in env_id))
 
 
+@pytest.mark.parametrize("scale", [0.76, 0.84])
+def test_crosses_on_the_stamina_bar(scale):
+    """Red on red, they do not show: with and without one, frames and so vectors are the same there."""
+    rows, crossed, stamina = combinations(np.arange(0, 84, 3), [False, True], [1, 10, 20])
+    options = {"agent_scale": scale, "show_stamina": True, "camera_offset_scale": 5.5}
+    pos = np.stack([np.full_like(rows, 66 + PAD), rows + PAD], axis=1)
+    state = {"pos": pos, "facing": np.zeros_like(rows), "shows_cross": crossed, "stamina": stamina}
+    _, (count, frames, vectors, _) = look("Endless-MysteryPath-v0", options, **state)
+    assert frames < count
+    assert vectors > 28
+
+
 @pytest.mark.parametrize("scale", [0.25, 0.5, 1.0])
 def test_origins_behind_large_agents(scale):
     columns, rows, x = combinations(np.arange(SIDE), np.arange(SIDE), [36, 42, 45])
