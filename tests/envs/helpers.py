@@ -15,6 +15,9 @@ MORTAR = pytest.mark.parametrize("env_id", MortarMayhem.variants)
 SPOTLIGHTS = pytest.mark.parametrize("env_id", SearingSpotlights.variants)
 
 
+FAMILIES = pytest.mark.parametrize("env_id", ["MortarMayhem-Grid-v0", "MysteryPath-v0", "SearingSpotlights-v0"])
+# Each id with one of the two, and each family with both: where the code that is tested is the same for all ids.
+ONE_OBS = pytest.mark.parametrize(("env_id", "obs_type"), [*zip(IDS, itertools.cycle(("pixels", "vector")))])
 EACH_OBS = pytest.mark.parametrize(("env_id", "obs_type"), [*itertools.product(IDS, ("pixels", "vector"))])
 HASTY = {  # options that end episodes soon; the end of some earns -1
     MortarMayhem: {"explosion_delay": [2], "explosion_duration": (1,), "reward_command_failure": -1},

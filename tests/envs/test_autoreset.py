@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
-from helpers import EACH, EACH_OBS, HASTY, check_same, make, roll
+from helpers import EACH, HASTY, ONE_OBS, check_same, make, roll
 from players import FAMILY
-from test_lanes import CHANGED, LANES, OPTIONS, Told, check_resets_and_steps, mixed_actions, reset_both
+from test_lanes import CHANGED, LANES, LEVELS, OPTIONS, Told, check_resets_and_steps, mixed_actions, reset_both
 
 from memory_gym_envs.old_gymnasium import warn_of
 
@@ -24,10 +24,9 @@ def both(env_id, mode, **arguments):
     return ours, SyncVectorEnv(lanes, autoreset_mode=mode)
 
 
-@EACH_OBS
-@pytest.mark.parametrize("levels", [{}, {"num_levels": 3, "start_level": 40}], ids=["any level", "3 levels"])
-def test_next_step_is_gymnasiums(env_id, obs_type, levels):
-    ours, theirs = both(env_id, NEXT, obs_type=obs_type, **levels)
+@ONE_OBS
+def test_next_step_is_gymnasiums(env_id, obs_type):
+    ours, theirs = both(env_id, NEXT, obs_type=obs_type, **LEVELS[obs_type])
     resets = [
         (11, HASTY[FAMILY[env_id]], None),
         ([5, None, 6, None, 0], OPTIONS[env_id], None),

@@ -9,7 +9,7 @@ from level_statistics import THESIS, fewest_steps, path_lengths, spotlight_lengt
 
 
 def test_optimal_length_of_spotlight_levels():
-    lengths = spotlight_lengths(5000)
+    lengths = spotlight_lengths(2000)
     mean, deviation, least, most, _ = THESIS["SearingSpotlights-v0"]
     assert abs(lengths.mean() - mean) < 0.5
     assert abs(lengths.std() - deviation) < 0.5

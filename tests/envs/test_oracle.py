@@ -108,7 +108,7 @@ def test_failing_at_the_last_command(env_id):
 def test_commands_completed_before_a_time_limit(env_id):
     """As many as were paid for: none while they are shown, and all that were checked, also while the fire burns."""
     found = set()
-    for limit in range(1, BOUNDS[env_id][1], 3):
+    for limit in range(1, BOUNDS[env_id][1], 4 if "Grid" in env_id else 12):  # half of a command's time
         envs = gym.make_vec(env_id, num_envs=2, max_episode_steps=limit)
         envs.reset(seed=3)
         truncated = [False]

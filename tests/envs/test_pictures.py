@@ -35,7 +35,11 @@ def test_no_render_mode_warns(env_id):
 def test_debug_render_circles_the_target(env_id):
     env = gym.make(env_id, render_mode="debug_rgb_array").unwrapped
     observation, info = env.reset(seed=2)
-    for _ in range(60):
+    for _ in range(20):
+        for _ in range(2):
+            observation, _, over, _, info = env.step(env.action_space.sample())
+            if over:
+                observation, info = env.reset()
         frame = env.render()
         assert frame.shape == (336, 336, 3)
         assert frame.dtype == np.uint8
@@ -48,9 +52,6 @@ def test_debug_render_circles_the_target(env_id):
         assert abs(columns.mean() + 0.5 - x) < 1
         assert np.ptp(rows) == np.ptp(columns) == 55
         assert np.array_equal(frame[~circle], picture(observation).repeat(4, 0).repeat(4, 1)[~circle])
-        observation, _, over, _, info = env.step(env.action_space.sample())
-        if over:
-            observation, info = env.reset()
 
 
 def test_clue_shows_every_command_and_hides_it_again():
@@ -84,13 +85,19 @@ def test_visual_feedback():
 # ---- Searing Spotlights ----
 
 
+def colors_of(frame):
+    numbers = np.unique(frame.reshape(-1, 3) @ np.array([1 << 16, 1 << 8, 1]))
+    return {(number >> 16, number >> 8 & 255, number & 255) for number in numbers.tolist()}
+
+
 @SPOTLIGHTS
 def test_debug_render_lights_everything(env_id):
     """Floor, agent, coin and exit show in the dark; green circles are where the agent's view is lit."""
     env = gym.make(env_id, render_mode="debug_rgb_array").unwrapped
     env.reset(seed=2, options={"spot_damage": 0, "light_dim_off_duration": 0})
-    for step in range(60):
-        observation, _, _, _, info = env.step([0, 0])
+    for step in range(25):
+        for _ in range(2):
+            observation, _, _, _, info = env.step([0, 0])
         frame = env.render()
         assert frame.shape == (336, 336, 3)
         assert frame.dtype == np.uint8
@@ -116,7 +123,7 @@ def test_spotlights_show_what_they_light():
     colors = set()
     for _ in range(120):
         observation, *_ = env.step([0, 0])
-        colors |= {tuple(pixel) for pixel in observation[4:].reshape(-1, 3).tolist()}
+        colors |= colors_of(observation[4:])
     rim, body, hand, coin, door = (255, 255, 255), (250, 204, 153), (50, 50, 50), (255, 165, 0), (55, 55, 55)
     assert colors <= {(0, 0, 0), rim, body, hand, coin, door}
     assert colors >= {(0, 0, 0), rim, body}
@@ -139,7 +146,7 @@ def test_visible_in_the_dark(env_id):
     env.reset(seed=4, options={**dict.fromkeys(names, True), "initial_spawns": 0})
     for _ in range(30):
         observation, _, over, _, _ = env.step([0, 0])
-        colors = {tuple(pixel) for pixel in observation[4:].reshape(-1, 3).tolist()}
+    colors = colors_of(observation[4:])
     assert not over
     assert colors >= {(0, 0, 0), (250, 204, 153), (255, 165, 0)}
     assert ((55, 55, 55) in colors) == ("exit_visible" in names)

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import EACH_OBS, HASTY, check_same
+from helpers import HASTY, ONE_OBS, check_same
 from players import FAMILY
 
 pytest.importorskip("stable_baselines3")
@@ -26,7 +26,7 @@ def both(env_id, **arguments):
     return make(env_id, **arguments), DummyVecEnv(lanes)
 
 
-@EACH_OBS
+@ONE_OBS
 def test_as_its_own(env_id, obs_type):
     ours, theirs = both(env_id, obs_type=obs_type, options=HASTY[FAMILY[env_id]])
     assert ours.observation_space == theirs.observation_space
