@@ -38,6 +38,7 @@ from ppo_utils.environments import envs_for, with_options
 from ppo_utils.errors import RunError
 from ppo_utils.evaluation import are_trained_on, evaluate, evaluation_levels, first_unseen, make_agent
 from ppo_utils.flags import NonNegativeInt, PositiveInt, check_bounds
+from ppo_utils.runs import report_out_of_memory
 from ppo_utils.scores import own_metric, summary, table, task_of, tasks_of
 from ppo_utils.terminal import one_line_exit, open_streams
 
@@ -123,13 +124,14 @@ def play(checkpoint: Checkpoint, config: Config) -> dict[str, np.ndarray]:
     agent, found = None, defaultdict(lambda: np.full(len(levels), np.nan))
     for start in range(0, len(levels), AT_ONCE):
         batch = levels[start : start + AT_ONCE]
-        envs = envs_for(args, len(batch), asynchronous=False)  # a process for each episode would be many
-        if agent is None:
-            _, infos = envs.reset()
-            agent = make_agent(checkpoint.script.Agent, envs, infos, args).to(device)
-            load_weights(agent, checkpoint.saved, checkpoint.path)
-            torch.manual_seed(config.seed)
-        played = evaluate(agent, envs, batch, config.max_steps, amp=args.amp, deterministic=config.deterministic)
+        with report_out_of_memory(config, device):
+            envs = envs_for(args, len(batch), asynchronous=False)  # a process for each episode would be many
+            if agent is None:
+                _, infos = envs.reset()
+                agent = make_agent(checkpoint.script.Agent, envs, infos, args).to(device)
+                load_weights(agent, checkpoint.saved, checkpoint.path)
+                torch.manual_seed(config.seed)
+            played = evaluate(agent, envs, batch, config.max_steps, amp=args.amp, deterministic=config.deterministic)
         envs.close()
         for name, numbers in played.items():
             found[name][start : start + AT_ONCE] = numbers

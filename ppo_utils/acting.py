@@ -10,6 +10,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 
 from ppo_utils.checkpoints import import_script, load_weights, read_model, saved_args
 from ppo_utils.environments import as_tensors, env_actions, envs_for, wrap_envs, wrappers_of
+from ppo_utils.errors import report_unusable_policy
 from ppo_utils.evaluation import MEMORY_STEPS, make_agent, with_room
 from ppo_utils.lanes import check_fits
 
@@ -54,7 +55,8 @@ class Player:
         obs = self.envs.reset()[0] if self.actions is None else self.envs.step(self.actions)[0]
         obs = as_tensors(obs, torch.device("cpu"))
         self.memory = with_room(self.agent.memory, self.memory, self.steps)
-        self.actions = self.agent.get_action_and_value(obs, self.memory, self.deterministic)[0].numpy()
+        with report_unusable_policy():
+            self.actions = self.agent.get_action_and_value(obs, self.memory, self.deterministic)[0].numpy()
         self.steps += 1
         action = env_actions(self.given.single_action_space, self.actions)[0]
         return action if np.ndim(action) else int(action)

@@ -12,6 +12,7 @@ from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
 from ppo_utils.environments import as_tensors
+from ppo_utils.errors import report_unusable_policy
 from ppo_utils.flags import RunArgs
 from ppo_utils.infos import final_numbers, ground_truth_of
 from ppo_utils.terminal import tell
@@ -72,7 +73,7 @@ def evaluate(
     obs, _ = envs.reset(seed=levels)
     playing = np.ones(len(levels), bool)
     metrics = {"return": np.zeros(len(levels)), "length": np.zeros(len(levels))}
-    with torch.autocast(device.type, torch.bfloat16, enabled=amp):
+    with report_unusable_policy(), torch.autocast(device.type, torch.bfloat16, enabled=amp):
         memory = agent.memory.begin_rollout(agent.memory.initial(len(levels), device), MEMORY_STEPS)
         for t in range(max_steps):
             memory = with_room(agent.memory, memory, t)

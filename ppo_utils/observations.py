@@ -17,10 +17,11 @@ from memory_gym_envs.options import brief
 from ppo_utils.errors import RunError
 from ppo_utils.lanes import OWN, Place
 from ppo_utils.terminal import tell
-from ppo_utils.wrappers import OBSERVATION, one_hot, rows_of
+from ppo_utils.wrappers import MOST_ENTRIES, OBSERVATION, one_hot, rows_of
 
 SMALLEST_IMAGE = 36  # pixels along a side; what is smaller becomes a vector
 WIDEST_RANGE = 2**16  # of an image's numbers
+LARGEST_ENTRY = 1e18  # of a vector: the squares of larger ones, which networks and losses compute, overflow float32
 WRITABLE = ("C_CONTIGUOUS", "WRITEABLE")  # wrappers overwrite observations in place
 INFOS = (OWN, "ground_truth", "_ground_truth", "final_obs", "_final_obs", "final_info", "_final_info")
 
@@ -146,6 +147,11 @@ class Part:
             if len(leaf.shape) == 2:  # a matrix
                 return cls(path, leaf)
         elif isinstance(leaf, (gym.spaces.Discrete, gym.spaces.MultiDiscrete, gym.spaces.MultiBinary)):
+            if (entries := gym.spaces.flatdim(leaf)) > MOST_ENTRIES:
+                raise ValueError(
+                    f"the observation space {name_of(path)}: {brief(leaf)} is not supported; one-hot it would have "
+                    f"{entries:,} entries, above {MOST_ENTRIES:,}; observe the number in a Box"
+                )
             return cls(path, leaf)
         raise ValueError(
             f"the observation space {name_of(path)}: {brief(leaf)} is not supported; use images (height, width, "
@@ -196,7 +202,12 @@ class Part:
         if isinstance(self.leaf, gym.spaces.MultiBinary):
             within(rows, 0, 1)
         with np.errstate(over="ignore"):
-            return finite(np.require(rows, np.float32, WRITABLE))
+            rows = finite(np.require(rows, np.float32, WRITABLE))
+        large = np.abs(rows) > LARGEST_ENTRY
+        if large.any():
+            index = tuple(np.argwhere(large)[0].tolist())
+            raise WrongValue(index[0], f"has an entry {rows[index]:g}; networks take none beyond {LARGEST_ENTRY:g}")
+        return rows
 
     def _as_image(self, values: np.ndarray) -> np.ndarray:
         """Move height and width of (n, ...) to the front, and join all other axes as channels: (n, H, W, C)."""

@@ -43,7 +43,7 @@ from ppo_utils.checkpoints import (
     write_file,
 )
 from ppo_utils.environments import envs_for, training_envs
-from ppo_utils.errors import LaneError, RunError
+from ppo_utils.errors import LaneError, RunError, report_unusable_policy
 from ppo_utils.evaluation import REPEATS, level_scores
 from ppo_utils.flags import RunArgs, as_flags, check_args, check_minibatches, flag
 from ppo_utils.logs import combine_logs, open_logs, start_tracking, write_logs
@@ -134,9 +134,10 @@ def report_out_of_memory(
         if isinstance(error, RuntimeError) and not re.search("allocate|out of memory|overflowed", str(error)):
             raise
         harmless = ("seed", "total_timesteps", "start_level", "num_levels", "anneal_steps", "num_minibatches")
-        harmless += ("update_epochs", "checkpoint_interval", "eval_interval", "eval_max_steps")
+        harmless += ("update_epochs", "checkpoint_interval", "eval_interval", "eval_max_steps", "max_steps")
         sizes = [each for each in fields(args) if type(each.default) is int and each.name not in harmless]
-        large = [each.name for each in sizes if getattr(args, each.name) > each.default] or ["num_envs", "num_steps"]
+        usual = [each.name for each in sizes if each.name in ("num_envs", "num_steps", "levels", "repeats")]
+        large = [each.name for each in sizes if getattr(args, each.name) > each.default] or usual
         large = " ".join(f"{flag(name)} {getattr(args, name)}" for name in large)
         bytes_of = [part.dtype.itemsize * math.prod(part.shape) for part in space.values()] if space else []
         if sum(bytes_of) > 1e6:
@@ -225,12 +226,13 @@ def make_folder(args: RunArgs, started_in: Path) -> Path:
 
 # ---- while it trains ----
 @contextlib.contextmanager
-def report_failed_write(folder: Path) -> Iterator[None]:
+def report_failed_write(run: Run) -> Iterator[None]:
     """Raise RunError if what is inside cannot write."""
     try:
         yield
     except OSError as error:
-        raise RunError(f"cannot write to {error.filename or folder} ({error.strerror})") from error
+        path = shown(Path(str(error.filename or run.folder)), run.started_in)
+        raise RunError(f"cannot write to {path} ({error.strerror})") from error
 
 
 def end_iteration(
@@ -255,7 +257,7 @@ def end_iteration(
     logs |= {f"eval/{name}": values.mean().item() for name, values in run.scores.items()}
     run.stop = any(all_gather(run.received_signal))
     logs, episodes = combine_logs(all_gather((logs, episodes)))
-    with report_failed_write(run.folder):
+    with report_failed_write(run):
         write_logs(args, run, logs, episodes)
         for name, values in run.scores.items():
             run.writer.add_tensor(f"eval_levels/{name}", values, run.step)
@@ -293,22 +295,22 @@ def run_to_end(args: RunArgs, run: Run, train: Callable[[Any, Run], None]) -> Pa
     """
     save_model, interrupt = args.save_model, None
     try:
-        with report_out_of_memory(args, run.device, more="num_minibatches"):
+        with report_out_of_memory(args, run.device, more="num_minibatches"), report_unusable_policy():
             train(args, run)
         if run.writer is not None:
-            with report_failed_write(run.folder):
+            with report_failed_write(run):
                 run.writer.flush()
     except KeyboardInterrupt as error:
         interrupt = error
     except (FloatingPointError, RunError) as error:
         save_model = False
         found = checkpoints_in(run.folder)
-        last = f"the last checkpoint is {found[-1]}" if found else "there is no checkpoint yet"
+        last = f"the last checkpoint is {shown(found[-1], run.started_in)}" if found else "there is no checkpoint yet"
         raise type(error)(f"iteration {run.iteration}: {error}; {last}") from error
     finally:
         try:
             if save_model:
-                with report_failed_write(run.folder):
+                with report_failed_write(run):
                     write_file(model_of(args, run), run.folder / "model.pt")
         finally:
             close(run)

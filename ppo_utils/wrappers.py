@@ -28,6 +28,7 @@ from memory_gym_envs.searing_spotlights.state import SPEED, TIME
 OBSERVATION = "observation"  # the name of an observation that is no Dict, where it becomes a part of one
 STEP_ENCODING, LAST_ACTION = "step_encoding", "last_action"  # parts of a Dict that the wrappers add
 SINES, COSINES = "sines", "cosines"
+MOST_ENTRIES = 2**24  # of a one-hot vector: the weights of a layer of 128 that takes it are 8 GB
 SPOT_STREAM = 2  # keeps the generators of the perturbation apart from those of the environment with the same seed
 HEAD_START = 0.3  # of its way, that a spotlight of the perturbation has gone when an episode begins
 SPAWNS = ("initial_spawns", "num_spawns", "initial_spawn_interval", "spawn_interval_threshold")
@@ -407,9 +408,15 @@ def named(observation: Any) -> dict[str, Any]:
 def branch_sizes(space: gym.Space) -> np.ndarray:
     """Return the number of actions of each branch, (A,); raise ValueError unless Discrete or MultiDiscrete."""
     if isinstance(space, gym.spaces.Discrete):
-        return np.array([space.n])
-    if isinstance(space, gym.spaces.MultiDiscrete) and space.nvec.ndim == 1 and space.nvec.size:
-        return space.nvec
+        sizes = np.array([space.n])
+    elif isinstance(space, gym.spaces.MultiDiscrete) and space.nvec.ndim == 1 and space.nvec.size:
+        sizes = space.nvec
+    else:
+        sizes = np.zeros(0, int)
+    if sizes.size and sum(sizes.tolist()) <= MOST_ENTRIES:
+        return sizes
+    if sizes.size:
+        raise ValueError(f"the action space {brief(space)} is not supported; it has more than {MOST_ENTRIES:,} actions")
     raise ValueError(f"the action space {brief(space)} is not supported; use Discrete or one-dimensional MultiDiscrete")
 
 

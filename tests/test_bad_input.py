@@ -53,7 +53,7 @@ CASES = {
     "--exp-name ../up": "--exp-name is '../up'; it must be a name without slashes",
     "--env-id CueRecall-v0 --capture-video": "needs an environment that draws images .*; CueRecall-v0 draws none",
     "--target-kl nan": "--target-kl is nan; it must be above 0",
-    "--vf-coef inf": "--vf-coef is inf; it must be 0 or more",
+    "--vf-coef inf": r"--vf-coef is inf; it must be 0 or more and at most 3\.4e\+38, where float32 ends",
     "--auxiliary-detach": "--auxiliary-detach needs --reconstruction-coef or --ground-truth-coef above 0",
     "--refresh-memory --update-epochs 1": "--refresh-memory needs --update-epochs above 1: the first epoch has fresh "
     "memory",

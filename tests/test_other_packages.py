@@ -10,6 +10,7 @@ import random
 import signal
 import sys
 import threading
+import types
 
 import gymnasium as gym
 import imageio_ffmpeg
@@ -20,8 +21,10 @@ from conftest import SCRIPTS, parse_args
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from test_environments import box, register, roll
 
+import evaluate
 import ppo_gru
-from ppo_utils import environments, evaluation, runs
+import ppo_trxl
+from ppo_utils import environments, evaluation, runs, video
 from ppo_utils.checkpoints import read_model
 from ppo_utils.environments import env_actions, envs_for, find_spec, make_envs
 from ppo_utils.errors import LaneError, RunError
@@ -496,6 +499,17 @@ def test_a_video_holds_every_observation_that_was_acted_on(fps, tmp_path, monkey
     assert marks_in(tmp_path / "episode-1.mp4") == [*range(128)]
 
 
+def test_every_video_has_its_own_limit(tmp_path, monkeypatch):
+    monkeypatch.setattr(video, "MAX_VIDEO_FRAMES", 4)
+    envs = make_envs(small(draw=lambda env: marked(env.t)), 2, render_mode="rgb_array")
+    envs.reset(seed=0)
+    envs = LaneVideo(envs, str(tmp_path))
+    list(roll(envs, 6))
+    envs.close()
+    for episode in (0, 1):
+        assert marks_in(tmp_path / f"episode-{episode}.mp4") == [0, 1, 2]
+
+
 GRAY = np.arange(48, dtype=np.uint8).reshape(6, 8)
 FRAMES = {
     "gray": GRAY,
@@ -539,6 +553,48 @@ def test_a_video_that_cannot_be_written_costs_itself(name, async_envs, tiny, cap
 
 
 # ---- lines ----
+@pytest.mark.parametrize(("number", "shown"), [(3e38, r"3e\+38"), (-1.1e18, r"-1\.1e\+18")])
+def test_numbers_that_a_network_cannot_take(tiny, number, shown):
+    see = lambda env: np.array([number if env.number == 1 and env.t == 2 else 1e18], np.float32)  # noqa: E731
+    says = rf"observation has an entry {shown}; networks take none beyond 1e\+18 \(environment 1, step 2 since"
+    with pytest.raises(RunError, match=says):
+        ppo_gru.main(tiny(env_id=small(count=itertools.count(), see=see)))
+
+
+def test_a_policy_that_is_not_finite(tiny):
+    args = tiny(ppo_trxl, env_id=small(earn=lambda env: 3e38), observe_last_action=True)
+    says = r"^iteration 1: the policy is not finite: .* try a lower --init-lr, .*; there is no checkpoint yet"
+    with pytest.raises(RunError, match=says):
+        ppo_trxl.main(args)
+
+
+@pytest.mark.parametrize(("what", "space"), [
+    ("observation", gym.spaces.Discrete(2**40)),
+    ("observation", gym.spaces.MultiDiscrete([2**23] * 4)),
+    ("action", gym.spaces.Discrete(2**40)),
+    ("action", gym.spaces.MultiDiscrete([2**62] * 4)),
+])  # fmt: skip
+def test_spaces_that_no_memory_holds(what, space):
+    def make(**_):
+        env = Small()
+        setattr(env, f"{what}_space", space)
+        return env
+
+    with pytest.raises(ValueError, match=f"the {what} space .* is not supported; .*16,777,216"):
+        make_envs(register(make), 1)
+
+
+def test_too_little_memory_for_an_evaluation(tiny, monkeypatch):
+    def full(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(evaluate, "envs_for", full)
+    agent = types.SimpleNamespace(args=tiny())
+    for given, named in (({}, "--levels 50 --repeats 3"), ({"levels": 400, "max_steps": 10**6}, "--levels 400")):
+        with pytest.raises(RunError, match=f"does not fit in the memory of cpu; use less of {named}$"):
+            evaluate.play(agent, evaluate.Config(cuda=False, **given))
+
+
 def test_a_large_observation_is_named_where_memory_is_short(tiny):
     large, small = gym.spaces.Dict({"a": box(0, 1, (10**7,))}), gym.spaces.Dict({"a": NUMBER})
     for space, named in ((large, "the observation, 40 MB each time; or of --num-envs 64"), (small, "--num-envs 64")):

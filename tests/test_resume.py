@@ -282,6 +282,7 @@ def test_what_else_a_run_goes_on_with(tiny, opened):
     again = opened(ppo_gru, parse_args(ppo_gru, "--resume", str(run.folder)))
     assert (np.random.rand(), random.random(), torch.rand(1).item()) == wanted  # noqa: NPY002
     assert (again.step, again.seconds) == (run.step, run.seconds)
+    assert again.bar.n == run.step
     assert run.seconds > 0
     assert (list(again.returns), list(again.lengths)) == (list(run.returns), list(run.lengths))
     assert run.returns
@@ -466,6 +467,16 @@ def test_flags_that_no_longer_exist(trained, capfd):
     torch.save({**saved, "args": saved["args"] | {"eval_repeats": 5}}, path)
     assert resumed(ppo_gru, trained) == trained
     assert f"--resume {trained}: it goes on without --eval-repeats, which no longer exist" in capfd.readouterr().err
+
+
+def test_a_flag_that_is_newer_than_the_run(trained):
+    """The run has its default, with which it goes on, and no other value."""
+    path = trained / "checkpoint-128.pt"
+    saved = read_model(path)
+    torch.save({**saved, "args": {name: value for name, value in saved["args"].items() if name != "clip_vloss"}}, path)
+    with pytest.raises(ValueError, match=r"--clip-vloss is False, but the run in .* has True; leave the flag out"):
+        resumed(ppo_gru, trained, "--no-clip-vloss")
+    assert resumed(ppo_gru, trained) == trained
 
 
 def test_a_run_that_another_process_has_gone_on_with(trained, monkeypatch):

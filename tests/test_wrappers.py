@@ -514,3 +514,25 @@ def test_fourier_features_without_a_vector():
     envs = gym.make_vec("MysteryPath-v0", num_envs=2)
     with pytest.raises(ValueError, match="needs an observation with a vector, not with observation alone"):
         FourierFeatures(envs, 2)
+
+
+@pytest.mark.parametrize("space", [
+    gym.spaces.Discrete(3, start=2), gym.spaces.MultiDiscrete([3, 2], start=[2, -1]),
+])  # fmt: skip
+def test_the_last_action_is_counted_from_the_space_s_start(space):
+    class Some(gym.Env):
+        observation_space, action_space = gym.spaces.Box(0, 1, (1,)), space
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            return np.zeros(1, np.float32), 0.5, False, False, {}
+
+    envs = LastAction(SyncVectorEnv([Some] * 2, autoreset_mode=AutoresetMode.SAME_STEP))
+    envs.reset()
+    actions = [3, 2] if isinstance(space, gym.spaces.Discrete) else [[3, -1], [2, 0]]
+    last = envs.step(np.array(actions))[0]["last_action"].tolist()
+    branch = [[0, 1, 0], [1, 0, 0]]
+    others = [[], []] if isinstance(space, gym.spaces.Discrete) else [[1, 0], [0, 1]]
+    assert last == [[*each, *other, 0.5] for each, other in zip(branch, others, strict=True)]
