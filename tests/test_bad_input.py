@@ -5,7 +5,6 @@ import fcntl
 import glob
 import os
 import re
-import subprocess
 import sys
 import types
 from dataclasses import asdict, replace
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import SCRIPTS, parse_args
+from programs import run_command
 
 import ppo_gru
 import ppo_trxl
@@ -76,8 +76,7 @@ TRANSFORMER_CASES = {
 
 
 def run(flags, cwd):
-    command = [sys.executable, SCRIPT, "--no-cuda", *flags]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
+    return run_command(SCRIPT, "--no-cuda", *flags, folder=cwd)
 
 
 def setup_error(args, script=ppo_gru):

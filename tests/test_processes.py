@@ -13,9 +13,11 @@ import time
 from pathlib import Path
 
 import numpy as np
+import programs
 import pytest
 import torch
 from conftest import collect, parse_args
+from programs import run_together
 
 import ppo_gru
 import ppo_trxl
@@ -59,6 +61,14 @@ def torchrun(*command, processes=2):
     return [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}", *command]
 
 
+def train_together(path, *flags):
+    """Run a program in two processes that are those of torchrun but for their imports; return what each printed."""
+    done = run_together(programs.command(path, *flags))
+    for each in done:
+        assert each.returncode == 0, each.stderr
+    return done
+
+
 def flags_of(script, **changes):
     flags = {"env-id": GRID["env_id"], "obs-type": "vector", "num-envs": 4, "num-steps": 16, "num-minibatches": 2}
     flags |= {"trunk-size": 16, "total-timesteps": 6 * 64, **changes}
@@ -94,8 +104,7 @@ def test_two_processes_make_the_update_of_one(tiny, opened):
     torch.save(given, "given.pt")
 
     Path("program.py").write_text(ONE_UPDATE)
-    environment = {**os.environ, "PYTHONPATH": os.path.dirname(ppo_gru.__file__)}
-    subprocess.run(torchrun("program.py"), env=environment, check=True, timeout=300)
+    train_together("program.py")
     updated = zip(*(torch.load(f"updated{rank}.pt") for rank in (0, 1)), given, alone, strict=True)
     for (first, logs), (second, _), (_, _, before, _), (wanted, wanted_logs) in updated:
         for name, weight in wanted.items():
@@ -180,14 +189,14 @@ def test_a_resumed_run_is_the_unstopped_one(curves):
     script = ppo_trxl
     extra = {"eval-interval": 2, "eval-levels": 2, "target-kl": 5e-6, "checkpoint-interval": 3}
     flags = flags_of(script, **extra)
-    subprocess.run(torchrun(script.__file__, *flags, "--exp-name", "whole"), check=True, timeout=300)
+    train_together(script.__file__, *flags, "--exp-name", "whole")
     half = [*flags, "--total-timesteps", "192", "--exp-name", "half"]
-    subprocess.run(torchrun(script.__file__, *half), check=True, timeout=300)
+    train_together(script.__file__, *half)
     (whole,), (half,) = (list(Path("runs").glob(f"*{name}*")) for name in ("whole", "half"))
     more = ["--resume", str(half), "--total-timesteps", "384"]
     with pytest.raises(ValueError, match="this run has 2 processes, not 1; start as many"):
         script.setup(parse_args(script, *more))
-    subprocess.run(torchrun(script.__file__, *more), check=True, timeout=300)
+    train_together(script.__file__, *more)
     before, after = curves(whole), curves(half)
     assert {step for step, _ in before["losses/loss"]} == {64, 128, 192, 256, 320, 384}
     assert 6 * 1 < sum(steps for _, steps in before["charts/gradient_steps"]) < 6 * 2 * 3, "target-kl ended some"
@@ -254,6 +263,7 @@ def test_a_signal_to_torchrun(curves):
 
 def test_environments_that_cannot_be_split():
     command = [ppo_gru.__file__, *flags_of(ppo_gru, **{"num-envs": 3, "total-timesteps": 480})]
-    done = subprocess.run(torchrun(*command), capture_output=True, text=True, timeout=300)
-    assert "ppo_gru.py: --num-envs is 3; it must be a multiple of the 2 processes" in done.stderr
+    for done in run_together(programs.command(*command)):
+        assert done.returncode == 1
+        assert done.stderr.splitlines() == ["ppo_gru.py: --num-envs is 3; it must be a multiple of the 2 processes"]
     assert not Path("runs").exists()

@@ -7,10 +7,9 @@ import os
 import pickle
 import random
 import re
+import resource
 import signal
-import subprocess
 import sys
-import threading
 import time
 import types
 from pathlib import Path
@@ -20,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import SCRIPTS, parse_args
+from programs import Program, command, run_command
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 import enjoy
@@ -353,17 +353,12 @@ def test_a_second_interrupt_ends_the_training_at_once(tiny, opened, monkeypatch)
 def test_a_signal_to_the_command(curves, tmp_path, number):
     """As a cluster sends it at a time limit: checkpoint and model are written, and the curve goes on."""
     flags = [*FEW, "--num-steps", "32", "--total-timesteps", "640000", "--save-model"]
-    command = [sys.executable, ppo_gru.__file__, *flags]
-    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
-        deadline = threading.Timer(200, process.kill)
-        deadline.start()
-        while "SPS=" not in process.stderr.read(40):
-            assert process.poll() is None
-        process.send_signal(number)
-        said = process.stderr.read()
-        deadline.cancel()
-    assert process.returncode == 128 + number, said
-    assert "Traceback" not in said
+    with Program(command(ppo_gru.__file__, *flags), tmp_path) as program:
+        program.wait_until(lambda: "SPS=" in program.said() or not program.is_running())
+        os.kill(program.pid, number)
+        done = program.wait()
+    assert done.returncode == 128 + number, done.stderr
+    assert "Traceback" not in done.stderr
     (folder,) = tmp_path.glob("runs/*")
     step = curves(folder)["losses/loss"][-1][0]
     assert read_model(folder / "model.pt")["step"] == read_checkpoint(folder)["step"] == step < 640_000
@@ -386,8 +381,7 @@ def trained(tiny):
 def fault(folder, *flags):
     """Resume by command; return the one line that it ends in, having changed nothing."""
     before = {path.name: path.read_bytes() for path in folder.iterdir()} if folder.is_dir() else None
-    command = [sys.executable, ppo_gru.__file__, "--resume", str(folder), *flags]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = run_command(ppo_gru.__file__, "--resume", folder, *flags)
     assert done.returncode == 1
     (line,) = done.stderr.strip().splitlines()
     if before is not None:
@@ -534,13 +528,13 @@ def test_a_malicious_pickle_runs_nothing(trained, package):
 
 def limited(size, *flags):
     """Train by command, with no file larger than size; return the line that it ends in."""
-    code = (
-        "import resource, runpy, sys; sys.argv = sys.argv[1:];"
-        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}));"
-        "runpy.run_path(sys.argv[0], run_name='__main__')"
-    )
-    command = [sys.executable, "-c", code, ppo_gru.__file__, *flags]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+    def train():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+        command(ppo_gru.__file__, *flags)()
+
+    with Program(train) as program:
+        done = program.wait()
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     return done.stderr.strip().splitlines()[-1]
