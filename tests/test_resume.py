@@ -8,6 +8,7 @@ import pickle
 import random
 import re
 import resource
+import shutil
 import signal
 import sys
 import time
@@ -109,21 +110,43 @@ def resumed(script, folder, *flags):
     return script.main(parse_args(script, "--resume", str(folder), *flags))
 
 
+def copied_after(monkeypatch, step):
+    """Copy the folder of the next run when it has written the checkpoint of a step; return where the copy will be."""
+    save, copy = runs.save_checkpoint, Path("runs/copy").absolute()
+
+    def saved(args, run):
+        save(args, run)
+        if run.step == step:
+            shutil.copytree(run.folder, copy)
+
+    monkeypatch.setattr(runs, "save_checkpoint", saved)
+    return copy
+
+
 @pytest.mark.parametrize("name", RUNS)
 def test_a_resumed_run_is_the_unstopped_one(tiny, curves, monkeypatch, name):
     changes = dict(RUNS[name])
     script = changes.pop("script", ppo_gru)
-    args = tiny(script, total_timesteps=5 * 64, num_levels=50, seed=3, **changes)
+    args = tiny(script, total_timesteps=4 * 64, checkpoint_interval=2, num_levels=50, seed=3, **changes)
+    folder = copied_after(monkeypatch, 2 * 64)
     whole = curves(script.main(args))
-    folder = interrupted(monkeypatch, script, args, 2)
-    stopped = curves(folder)
-    assert {step for step, _ in stopped["losses/loss"]} == {64, 128}
+    assert {step for step, _ in curves(folder)["losses/loss"]} == {64, 128}
     torch.manual_seed(99)
     np.random.seed(99)  # noqa: NPY002
     assert resumed(script, folder) == folder
     assert curves(folder) == whole
-    assert len(whole["losses/loss"]) == 5
+    assert len(whole["losses/loss"]) == 4
     assert ("eval/return" in whole) == ("eval_interval" in changes)
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_run_that_a_signal_stopped_goes_on(tiny, curves, monkeypatch, script):
+    args = tiny(script, **GRID, total_timesteps=4 * 64)
+    whole = curves(script.main(args))
+    folder = interrupted(monkeypatch, script, args, 2)
+    assert {step for step, _ in curves(folder)["losses/loss"]} == {64, 128}
+    assert resumed(script, folder) == folder
+    assert curves(folder) == whole
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
@@ -373,9 +396,17 @@ CONTRADICTIONS = {
 }
 
 
+@pytest.fixture(scope="session")
+def trained_once(tiny, tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("trained"))
+        return ppo_gru.main(tiny(**GRID, checkpoint_interval=1)).absolute()
+
+
 @pytest.fixture
-def trained(tiny):
-    return ppo_gru.main(tiny(**GRID, checkpoint_interval=1))
+def trained(trained_once):
+    """The folder of a run of two iterations, with the checkpoints of both, for this test alone."""
+    return shutil.copytree(trained_once, Path("runs") / trained_once.name)
 
 
 def fault(folder, *flags):
@@ -580,20 +611,20 @@ def test_a_disk_that_became_read_only(tiny, monkeypatch):
 
 def test_no_room_for_a_checkpoint(curves):
     """The one before stays whole, and the run goes on from it when there is room again."""
-    interval = ["--checkpoint-interval", "10"]
-    folder = ppo_gru.main(parse_args(ppo_gru, *FEW, *interval, "--total-timesteps", "160"))
-    kept = (folder / "checkpoint-160.pt").read_bytes()
-    line = limited(len(kept) // 2, "--resume", str(folder), "--total-timesteps", "480")
+    interval = ["--checkpoint-interval", "2"]
+    folder = ppo_gru.main(parse_args(ppo_gru, *FEW, *interval, "--total-timesteps", "32"))
+    kept = (folder / "checkpoint-32.pt").read_bytes()
+    line = limited(len(kept) // 2, "--resume", str(folder), "--total-timesteps", "96")
     said = (
-        rf"ppo_gru\.py: iteration 20: cannot write to {folder}/checkpoint-320\.pt \(File too large\); "
-        rf"the last checkpoint is {folder}/checkpoint-160\.pt"
+        rf"ppo_gru\.py: iteration 4: cannot write to {folder}/checkpoint-64\.pt \(File too large\); "
+        rf"the last checkpoint is {folder}/checkpoint-32\.pt"
     )
     assert re.fullmatch(said, line), line
-    assert [path.name for path in folder.glob("checkpoint*")] == ["checkpoint-160.pt"]
-    assert (folder / "checkpoint-160.pt").read_bytes() == kept
+    assert [path.name for path in folder.glob("checkpoint*")] == ["checkpoint-32.pt"]
+    assert (folder / "checkpoint-32.pt").read_bytes() == kept
     time.sleep(1)  # TensorBoard sorts files by the second at which they begin, then by process: of one second, wrongly
-    resumed(ppo_gru, folder, "--total-timesteps", "480")
-    assert curves(folder) == curves(ppo_gru.main(parse_args(ppo_gru, *FEW, "--total-timesteps", "480")))
+    resumed(ppo_gru, folder, "--total-timesteps", "96")
+    assert curves(folder) == curves(ppo_gru.main(parse_args(ppo_gru, *FEW, "--total-timesteps", "96")))
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

@@ -1,5 +1,6 @@
 """A short training of each kind, through `main` and through the command line."""
 
+import contextlib
 import dataclasses
 import glob
 import math
@@ -10,17 +11,19 @@ import subprocess
 import sys
 import traceback
 import types
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from conftest import SCRIPTS, parse_args
+from programs import run_command
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import ppo_gru
 import ppo_trxl
-from ppo_utils import runs
+from ppo_utils import logs, runs
 from ppo_utils.checkpoints import read_model, saved_args
 from ppo_utils.flags import check_args, flag
 
@@ -107,8 +110,11 @@ class Faulty(gym.Env):
 gym.register("Faulty-v0", entry_point=Faulty)
 
 
-@pytest.mark.parametrize("memory", MEMORIES)
-@pytest.mark.parametrize("env_id", ["MortarMayhem-Grid-v0", "MortarMayhemB-v0", "CartPole-v1", "Image-v0"])
+OTHER_ENVS = ["MortarMayhem-Grid-v0", "MortarMayhemB-v0", "Image-v0"]  # vectors with each memory, others with two
+PAIRS = [*(("CartPole-v1", memory) for memory in MEMORIES), *zip(2 * OTHER_ENVS, MEMORIES, strict=True)]
+
+
+@pytest.mark.parametrize(("env_id", "memory"), PAIRS)
 def test_trains(tiny, scalars, env_id, memory):
     script = memory.get("script", ppo_gru)
     curves = scalars(script.main(tiny(env_id=env_id, num_steps=32, total_timesteps=256, **memory)))
@@ -181,11 +187,14 @@ def test_episodes_are_counted_across_rollouts(played):
     assert episodes["charts/episodic_return"] == episodes["episode/right"]
 
 
-@pytest.mark.parametrize("env_id", ["MortarMayhemB-Grid-v0", "GlobalGenerators-v0"])
-@pytest.mark.parametrize("script", SCRIPTS)
+@pytest.mark.parametrize(
+    ("script", "env_id"),
+    [*((script, "MortarMayhemB-Grid-v0") for script in SCRIPTS), (ppo_gru, "GlobalGenerators-v0")],
+)
 def test_same_seed_same_curves(tiny, curves, script, env_id):
+    """Of pixels too: tests/test_resume.py goes on from them."""
     first, second, other = (
-        curves(script.main(tiny(script, env_id=env_id, exp_name=name, seed=seed)))
+        curves(script.main(tiny(script, env_id=env_id, obs_type="vector", exp_name=name, seed=seed)))
         for name, seed in (("a", 1), ("b", 1), ("c", 2))
     )
     for name in first:
@@ -251,13 +260,11 @@ def test_interrupting_keeps_what_was_learned(tiny, monkeypatch):
     assert glob.glob("runs/*/model.pt")
 
 
-def test_steps_are_counted_without_a_progress_bar(tiny):
-    code = f"import ppo_gru; ppo_gru.main(ppo_gru.{tiny(env_id='CartPole-v1')!r})"
-    environment = {**os.environ, "TQDM_DISABLE": "1", "PYTHONPATH": os.path.dirname(ppo_gru.__file__)}
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=300, env=environment)
-    events = EventAccumulator(glob.glob("runs/*")[0])
-    events.Reload()
-    assert [point.step for point in events.Scalars("charts/SPS")] == [64, 128]
+def test_steps_are_counted_without_a_progress_bar(tiny, curves, monkeypatch):
+    """As with TQDM_DISABLE=1, which tqdm reads when it is imported."""
+    monkeypatch.setattr(logs, "tqdm", partial(logs.tqdm, disable=True))
+    logged = curves(ppo_gru.main(tiny(env_id="CartPole-v1")))
+    assert [step for step, _ in logged["losses/loss"]] == [64, 128]
 
 
 def test_bfloat16_is_used_and_changes_little(tiny, scalars):
@@ -356,6 +363,14 @@ def test_save_and_load(tiny, opened, memory):
     assert [name for name in os.listdir(folder) if name.startswith("model")] == ["model.pt"]
 
 
+@pytest.fixture(scope="session")
+def trained_on_90_levels(tiny, tmp_path_factory):
+    """The weights of a training on levels 12 to 101."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("trained"))
+        return str((ppo_gru.main(tiny(start_level=12, num_levels=90, save_model=True)) / "model.pt").absolute())
+
+
 @pytest.mark.parametrize(
     ("flags", "levels"),
     [
@@ -367,9 +382,10 @@ def test_save_and_load(tiny, opened, memory):
         ({"num_levels": 50, "env_id": "MysteryPath-Grid-v0"}, None),
     ],
 )
-def test_levels_of_an_evaluation_that_loaded_weights_were_trained_on(tiny, opened, capsys, flags, levels):
-    path = str(ppo_gru.main(tiny(start_level=12, num_levels=90, save_model=True)) / "model.pt")
-    capsys.readouterr()
+def test_levels_of_an_evaluation_that_loaded_weights_were_trained_on(
+    tiny, opened, capsys, trained_on_90_levels, flags, levels
+):
+    path = trained_on_90_levels
     opened(ppo_gru, tiny(**{"eval_levels": 10, "load_model": path, **flags}))
     told = (
         f"{path} was trained on levels 12 to 101, and evaluations of this run play levels {levels}; --start-level 102 "
@@ -415,7 +431,7 @@ def test_a_run_that_is_extended_keeps_its_schedule(monkeypatch):
 
 def test_the_last_lines(tiny, capsys, monkeypatch):
     """The folder with the score, and the commands that evaluate, watch and plot."""
-    args = tiny(env_id="MortarMayhemB-Grid-v0", total_timesteps=256, num_steps=64)
+    args = tiny(env_id="MortarMayhemB-Grid-v0", obs_type="vector", total_timesteps=256, num_steps=64)
     folder = ppo_gru.main(args).relative_to(os.getcwd())
     score, *commands = capsys.readouterr().out.splitlines()
     assert re.fullmatch(rf"{folder}: 256 steps, return -?\d\.\d\d, mean of the last \d+ episodes", score)
@@ -433,7 +449,8 @@ def test_the_last_lines(tiny, capsys, monkeypatch):
     assert re.fullmatch(rf"{folder}: 256 steps, return -?\d\.\d\d on 2 unseen levels", score)
     assert commands[0] == f"evaluate: python evaluate.py {folder / 'model.pt'}"
     assert commands[1].startswith('watch: pip install -e ".[eval]" && python enjoy.py')
-    folder = ppo_gru.main(tiny(env_id="MysteryPath-v0", checkpoint_interval=0, exp_name="c d")).relative_to(os.getcwd())
+    args = tiny(env_id="MysteryPath-v0", obs_type="vector", checkpoint_interval=0, exp_name="c d")
+    folder = ppo_gru.main(args).relative_to(os.getcwd())
     told = [f"{folder}: 128 steps, no episode ended", f"plot: tensorboard --logdir '{folder}'"]
     assert capsys.readouterr().out.splitlines() == told
 
@@ -490,29 +507,32 @@ def test_a_preset_is_good_for_environments_without_vectors(scalars, script):
     assert len(scalars(script.main(args))["losses/loss"]) == 1
 
 
-@pytest.mark.parametrize(("script", "width"), [(ppo_gru, "--hidden-size"), (ppo_trxl, "--trxl-dim")])
-def test_command_line(tmp_path, script, width):
-    flags = "--env-id MortarMayhem-Grid-v0 --total-timesteps 128 --num-envs 2 --num-steps 64 --num-minibatches 2"
-    command = [sys.executable, script.__file__, *flags.split(), width, "16", "--no-cuda", "--save-model"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+WITHOUT_EXTRAS = """
+import contextlib, runpy, sys
+sys.modules |= dict.fromkeys(["imageio_ffmpeg", "wandb", "pygame", "matplotlib", "scipy", "PIL", "plotly", "pytest"])
+for script in {scripts}:
+    with contextlib.suppress(SystemExit):
+        runpy.run_path(script, run_name="__main__")
+"""
+
+
+def test_scripts_need_no_extra(tmp_path):
+    """In an interpreter of its own, where nothing is imported yet, and none of what an extra brings can be."""
+    flags = "--env-id MortarMayhem-Grid-v0 --obs-type vector --total-timesteps 128 --num-envs 2 --num-steps 64"
+    flags = [*flags.split(), "--num-minibatches", "2", "--trunk-size", "16", "--no-cuda", "--save-model"]
+    code = WITHOUT_EXTRAS.format(scripts=[script.__file__ for script in SCRIPTS])
+    environ = {**os.environ, "PYTHONPATH": os.path.dirname(ppo_gru.__file__)}
+    line = [sys.executable, "-c", code, *flags]
+    done = subprocess.run(line, cwd=tmp_path, env=environ, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    assert re.search(r"return=-?\d.*length=\d.*SPS=\d", done.stderr), "the progress bar"
-    (folder,) = (tmp_path / "runs").iterdir()
-    assert folder.name.startswith(f"MortarMayhem-Grid-v0__{script.__name__}__1__")
-    assert (folder / "model.pt").exists()
-
-
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_the_script_needs_no_extra(script):
-    """What only an extra brings must not be imported with the script."""
-    extras = ("imageio_ffmpeg", "wandb", "pygame", "matplotlib", "pytest")
-    code = f"import sys; sys.modules.update(dict.fromkeys({extras})); import {script.__name__}"
-    subprocess.run([sys.executable, "-c", code], cwd=os.path.dirname(script.__file__), check=True, timeout=300)
+    assert len(re.findall(r"return=-?\d.*length=\d.*SPS=\d", done.stderr)) >= len(SCRIPTS), "the progress bars"
+    for script in SCRIPTS:
+        assert len([*tmp_path.glob(f"runs/MortarMayhem-Grid-v0__{script.__name__}__1__*/model.pt")]) == 1, done.stderr
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_help(script):
-    shown = subprocess.run([sys.executable, script.__file__, "--help"], capture_output=True, text=True, timeout=300)
+    shown = run_command(script.__file__, "--help")
     assert shown.returncode == 0
     for name in script.Args.__dataclass_fields__:
         assert flag(name) in shown.stdout
