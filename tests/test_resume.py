@@ -34,22 +34,23 @@ from ppo_utils.run_logs import read_run
 
 GRID = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector"}
 ENDLESS = {"env_id": "Endless-SearingSpotlights-v0", "obs_type": "vector"}
+# What has a state of its own is in one of these; together, where neither hides the other.
 RUNS = {
-    "GRU, pixels": {"env_id": "MortarMayhemB-Grid-v0"},
+    "GRU, pixels, veil": {"env_id": "MortarMayhemB-Grid-v0", "spotlight_perturbation": True},
     "GRU, endless": {**ENDLESS, "seq_len": 5, "num_layers": 2, "refresh_memory": True},
-    "LSTM": {**GRID, "memory": "lstm"},
-    "LSTM, endless pixels, reconstruction": {
-        "env_id": "Endless-MortarMayhem-v0", "memory": "lstm", "reconstruction_coef": 0.1
+    "LSTM, pixels, reconstruction": {
+        "env_id": "MortarMayhemB-Grid-v0", "memory": "lstm", "reconstruction_coef": 0.1
     },
     "no memory, stack": {**GRID, "memory": "none", "frame_stack": 3, "step_encoding": True, "norm_adv": "batch"},
-    "GRU, ground truth": {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "ground_truth_coef": 0.1},
-    "GRU, probe": {**GRID, "ground_truth_coef": 0.1, "auxiliary_detach": True, "observe_last_action": True},
-    "GRU, evaluations": {**GRID, "eval_interval": 2, "eval_levels": 2},
-    "GRU, truncated": {
-        "env_id": "SearingSpotlights-v0", "env_options": '{"max_steps": 9}', "bootstrap_truncated": True
+    "GRU, probe": {
+        "env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "ground_truth_coef": 0.1, "auxiliary_detach": True,
+        "observe_last_action": True,
     },
-    "GRU, veil": {"env_id": "MysteryPath-v0", "spotlight_perturbation": True},
-    "TrXL, absolute": {"script": ppo_trxl, **GRID},
+    "GRU, no embedding, evaluations": {**GRID, "embedding": False, "eval_interval": 2, "eval_levels": 2},
+    "GRU, Muon, truncated": {
+        "env_id": "SearingSpotlights-v0", "obs_type": "vector", "env_options": '{"max_steps": 9}',
+        "bootstrap_truncated": True, "optimizer": "muon", "norm_reward": True,
+    },
     "TrXL, endless": {"script": ppo_trxl, "env_id": "Endless-MysteryPath-v0", "obs_type": "vector"},
     "TrXL, learned": {
         "script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "learned", "trxl_query_position": True
@@ -58,17 +59,13 @@ RUNS = {
         "script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "relative", "trxl_segment_length": 5,
         "trxl_memory_gradient": True, "refresh_memory": True,
     },
-    "TrXL, output in the query": {
-        "script": ppo_trxl, **ENDLESS, "trxl_layer_norm": "post"
+    "TrXL, no encoding, post-norm": {
+        "script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "none", "trxl_layer_norm": "post"
     },
-    "GRU, no embedding": {**GRID, "embedding": False},
-    "TrXL, no encoding": {"script": ppo_trxl, **ENDLESS, "trxl_positional_encoding": "none"},
-    "GTrXL, pixels, evaluations": {
-        "script": ppo_trxl, "env_id": "MortarMayhem-Grid-v0", "trxl_gate": "gru", "eval_interval": 1, "eval_levels": 1,
-        "eval_max_steps": 30,
+    "GTrXL, Muon, pixels, evaluations": {
+        "script": ppo_trxl, "env_id": "MortarMayhem-Grid-v0", "trxl_gate": "gru", "optimizer": "muon",
+        "eval_interval": 1, "eval_levels": 1, "eval_max_steps": 30,
     },
-    "GRU, Muon": {**GRID, "optimizer": "muon", "norm_reward": True},
-    "GTrXL, Muon": {"script": ppo_trxl, **ENDLESS, "trxl_gate": "gru", "optimizer": "muon"},
     "TrXL, both heads": {
         "script": ppo_trxl, "env_id": "SearingSpotlights-v0", "ground_truth_coef": 0.1, "reconstruction_coef": 0.1,
         "auxiliary_detach": True,
@@ -350,7 +347,8 @@ def test_a_checkpoint_holds_what_the_next_rollout_begins_with(tiny):
 
 def test_videos_go_on(tiny, monkeypatch):
     pytest.importorskip("imageio_ffmpeg")
-    args = tiny(env_id="MortarMayhemB-Grid-v0", total_timesteps=8 * 64, capture_video=True)
+    short = {"env_options": '{"command_count": [1]}', "total_timesteps": 4 * 64}
+    args = tiny(**GRID, **short, capture_video=True)
     whole = ppo_gru.main(args)
     folder = interrupted(monkeypatch, ppo_gru, args, 2)
     resumed(ppo_gru, folder)

@@ -1,6 +1,5 @@
 """A short training of each kind, through `main` and through the command line."""
 
-import contextlib
 import dataclasses
 import glob
 import math
