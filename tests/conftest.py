@@ -15,6 +15,7 @@ from gymnasium.utils import seeding
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.summary.writer import event_file_writer
 from tensorboard.util.tensor_util import make_ndarray
+from xdist.scheduler import WorkStealingScheduling
 
 import ppo_gru
 import ppo_trxl
@@ -31,6 +32,12 @@ OTHERS = [importlib.import_module(path.stem) for path in sorted(ROOT.glob("ppo_*
 OTHERS = [script for script in OTHERS if script not in (ppo_gru, ppo_trxl)]
 SCRIPTS = [ppo_gru, ppo_trxl, *OTHERS]
 SMALL = {"hidden_size": 32, "trxl_dim": 32, "trxl_num_heads": 2, "trxl_num_layers": 2, "trxl_memory_length": 7}
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Let a process of `-n auto` that has nothing left to do take tests from another, so that all end together."""
+    return WorkStealingScheduling(config, log) if config.option.dist == "load" else None
 
 
 def pytest_terminal_summary(terminalreporter):
@@ -77,7 +84,7 @@ def tiny():
 
     def make(script=ppo_gru, **changes):
         small = {name: size for name, size in SMALL.items() if hasattr(script.Args, name)}
-        few = {"num_envs": 4, "num_steps": 16, "num_minibatches": 2, "update_epochs": 2, **small}
+        few = {"num_envs": 4, "num_steps": 16, "num_minibatches": 2, "update_epochs": 2, "trunk_size": 32, **small}
         return script.Args(**{"cuda": False, "total_timesteps": 128, **few, **changes})
 
     return make

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from programs import run_command
+
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/add_a_memory.md").read_text()
 (MEMORY,) = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
@@ -37,23 +39,20 @@ def follow(folder):
 def test_the_memory_of_the_page(tmp_path):
     follow(tmp_path)
 
-    def python(*command):
-        done = subprocess.run(
-            [sys.executable, *command],
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": str(tmp_path)},
-            capture_output=True,
-            text=True,
-            timeout=300,
-        )
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider"]
+    command += ["tests/test_memory.py", "tests/test_resume.py", "-k", "mingru"]
+    environ = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert int(re.search(r"(\d+) passed", done.stdout).group(1)) >= 19
+
+    def python(path, *flags):
+        done = run_command(tmp_path / path, *flags, folder=tmp_path, PYTHONPATH=str(tmp_path))
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    tests = ("tests/test_memory.py", "tests/test_resume.py", "-k", "mingru")
-    told = python("-m", "pytest", "-p", "no:cacheprovider", *tests)
-    assert int(re.search(r"(\d+) passed", told).group(1)) >= 19
     few = ["--seeds", "1", "--steps", "2e4", "--evaluations", "1", "--test-levels", "5"]
-    learning = ("benchmarks/learning.py", "--tasks", "mortar-mayhem", "--agents", "ppo_mingru.py", *few)
-    assert "\n| ppo_mingru.py | 0." in python(*learning)
+    tasks = ("--tasks", "mortar-mayhem", "--agents", "ppo_mingru.py")
+    assert "\n| ppo_mingru.py | 0." in python("benchmarks/learning.py", *tasks, *few)
     (model,) = tmp_path.glob("learning/runs/*/model.pt")
     assert "| ppo_mingru-py | 1 |" in python("evaluate.py", str(model), "--levels", "1", "--repeats", "1")

@@ -473,10 +473,10 @@ def marks_in(path):
     return [sum(int(frame[8, 8 + 16 * bit] > 127) << bit for bit in range(8)) for frame in frames]
 
 
-@pytest.mark.parametrize("first", range(1, 131, 26))
+@pytest.mark.parametrize("first", [1, 4, 8])
 def test_every_step_is_in_the_video_once_and_in_order(first, tmp_path):
-    """130 lengths, and each frame rate from 1 to 60 at least twice."""
-    for length in range(first, first + 26):
+    """36 lengths, each with another of the frame rates from 1 to 60."""
+    for length in range(first, 131, 11):
         fps = 1 + 7 * length % 60
         path, writer = tmp_path / "some.mp4", None
         writer = video_writer(path, (16, 128, 3), fps)

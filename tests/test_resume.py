@@ -277,12 +277,13 @@ def test_an_environment_that_changes_the_folder(tiny, tmp_path, monkeypatch, cap
 @pytest.mark.parametrize("draw", [np.random.rand, random.random])
 def test_episodes_drawn_from_a_global_generator_are_not_repeated(tiny, opened, monkeypatch, draw):
     class Drawn(type(gym.make("CueRecall-v0").unwrapped)):
-        def reset(self, **given):
-            _, info = super().reset(**given)
+        def reset(self, *, seed=None, options=None):
+            _, info = super().reset(seed=seed, options=options)
             return np.full(3, draw(), np.float32), info
 
-    gym.register("Drawn-v0", Drawn)
-    args = tiny(env_id="Drawn-v0", total_timesteps=3 * 64)
+    env_id = f"Drawn{len(gym.registry)}-v0"
+    gym.register(env_id, Drawn)
+    args = tiny(env_id=env_id, total_timesteps=3 * 64)
     first = opened(ppo_gru, args).rollout.next_obs["observation"]
     folder = interrupted(monkeypatch, ppo_gru, args, 1)
     run = opened(ppo_gru, parse_args(ppo_gru, "--resume", str(folder)))
