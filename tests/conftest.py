@@ -84,7 +84,7 @@ def tiny():
 
     def make(script=ppo_gru, **changes):
         small = {name: size for name, size in SMALL.items() if hasattr(script.Args, name)}
-        few = {"num_envs": 4, "num_steps": 16, "num_minibatches": 2, "update_epochs": 2, "trunk_size": 32, **small}
+        few = {"num_envs": 4, "num_steps": 16, "num_minibatches": 2, "update_epochs": 2, **small}
         return script.Args(**{"cuda": False, "total_timesteps": 128, **few, **changes})
 
     return make
