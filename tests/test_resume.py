@@ -259,8 +259,9 @@ def test_an_environment_that_changes_the_folder(tiny, tmp_path, monkeypatch, cap
             os.chdir("/")
             return super().step(action)
 
-    gym.register("Away-v0", Away)
-    args = tiny(env_id="Away-v0", checkpoint_interval=1, save_model=True)
+    env_id = f"Away{len(gym.registry)}-v0"
+    gym.register(env_id, Away)
+    args = tiny(env_id=env_id, checkpoint_interval=1, save_model=True)
     (folder,) = {ppo_gru.main(args)}
     assert folder.parent == tmp_path / "runs"
     assert {"model.pt", "checkpoint-64.pt", "checkpoint-128.pt"} < {*os.listdir(folder)}
@@ -285,10 +286,10 @@ def test_episodes_drawn_from_a_global_generator_are_not_repeated(tiny, opened, m
     env_id = f"Drawn{len(gym.registry)}-v0"
     gym.register(env_id, Drawn)
     args = tiny(env_id=env_id, total_timesteps=3 * 64)
-    first = opened(ppo_gru, args).rollout.next_obs["observation"]
+    first = opened(ppo_gru, args).carry.obs["observation"]
     folder = interrupted(monkeypatch, ppo_gru, args, 1)
     run = opened(ppo_gru, parse_args(ppo_gru, "--resume", str(folder)))
-    assert not (run.rollout.next_obs["observation"] == first).any()
+    assert not (run.carry.obs["observation"] == first).any()
 
 
 def test_what_else_a_run_goes_on_with(tiny, opened):
@@ -404,9 +405,9 @@ def trained_once(tiny, tmp_path_factory):
 
 
 @pytest.fixture
-def trained(trained_once):
+def trained(trained_once, tmp_path):
     """The folder of a run of two iterations, with the checkpoints of both, for this test alone."""
-    return shutil.copytree(trained_once, Path("runs") / trained_once.name)
+    return shutil.copytree(trained_once, tmp_path / "runs" / trained_once.name)
 
 
 def fault(folder, *flags):
