@@ -10,7 +10,7 @@ STEPS = 50 * 32 * 52  # 50 iterations at most: when the task is solved differs f
 BATCH = {"num_envs": 32, "num_steps": 52, "num_minibatches": 4, "update_epochs": 6, "total_timesteps": STEPS}
 RATES = {"init_lr": 2e-3, "final_lr": 1e-4, "init_ent_coef": 1e-2, "final_ent_coef": 1e-3, "anneal_steps": STEPS}
 LIMITS = {"clip_coef": 0.2, "max_grad_norm": 0.5, "target_kl": 0.02}
-SETTINGS = {**BATCH, **RATES, **LIMITS, "env_id": "CueRecall-v0", "gamma": 0.99, "trunk_size": 64}
+SETTINGS = {**BATCH, **RATES, **LIMITS, "env_id": "CueRecall-v0", "gamma": 0.99}
 WINDOW = {"trxl_num_layers": 1, "trxl_memory_length": 16, "trxl_segment_length": 52}
 
 
@@ -60,4 +60,5 @@ def test_transformer_memory(tiny, trained, encoding, gate):
 
 @pytest.mark.slow
 def test_with_bfloat16(tiny, trained):
-    assert trained(ppo_trxl, tiny(ppo_trxl, **WINDOW, **SETTINGS, amp=True)) >= 0.95
+    """With small heads: products of large matrices take 30 times as long on a processor that has no bfloat16."""
+    assert trained(ppo_trxl, tiny(ppo_trxl, **WINDOW, **SETTINGS, trunk_size=64, amp=True)) >= 0.95
