@@ -294,7 +294,7 @@ def test_a_training_stops_before_what_is_not_finite(tiny, script, what, earned):
     where = f"environment 2, step 1 since its reset with seed {levels[0]}"
     assert f"iteration 2: {args.env_id}: {says} ({where})" in str(error.value)
     assert 0 <= levels[0] < args.num_levels
-    assert f"the last checkpoint is {os.getcwd()}/runs/" in str(error.value)
+    assert "the last checkpoint is runs/" in str(error.value)
     assert "checkpoint-64.pt" in str(error.value)
     assert "init-lr" not in str(error.value)
 

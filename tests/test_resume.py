@@ -46,10 +46,12 @@ RUNS = {
         "env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "ground_truth_coef": 0.1, "auxiliary_detach": True,
         "observe_last_action": True,
     },
-    "GRU, no embedding, evaluations": {**GRID, "embedding": False, "eval_interval": 2, "eval_levels": 2},
+    "GRU, no embedding, scaled rewards, evaluations": {
+        **GRID, "embedding": False, "norm_reward": True, "eval_interval": 2, "eval_levels": 2
+    },
     "GRU, Muon, truncated": {
         "env_id": "SearingSpotlights-v0", "obs_type": "vector", "env_options": '{"max_steps": 9}',
-        "bootstrap_truncated": True, "optimizer": "muon", "norm_reward": True,
+        "bootstrap_truncated": True, "optimizer": "muon",
     },
     "TrXL, endless": {"script": ppo_trxl, "env_id": "Endless-MysteryPath-v0", "obs_type": "vector"},
     "TrXL, learned": {
@@ -578,8 +580,7 @@ FEW = ["--env-id", "MortarMayhemB-Grid-v0", *FEW.split()]
 
 def test_no_room_for_curves():
     line = limited(20_000, *FEW, "--total-timesteps", "9600", "--checkpoint-interval", "0")
-    folder = rf"{os.getcwd()}/runs/\S+"
-    said = rf"ppo_gru\.py: iteration \d+: cannot write to {folder} \(File too large\); there is no checkpoint yet"
+    said = r"ppo_gru\.py: iteration \d+: cannot write to runs/\S+ \(File too large\); there is no checkpoint yet"
     assert re.fullmatch(said, line), line
 
 
@@ -618,8 +619,8 @@ def test_no_room_for_a_checkpoint(curves):
     kept = (folder / "checkpoint-32.pt").read_bytes()
     line = limited(len(kept) // 2, "--resume", str(folder), "--total-timesteps", "96")
     said = (
-        rf"ppo_gru\.py: iteration 4: cannot write to {folder}/checkpoint-64\.pt \(File too large\); "
-        rf"the last checkpoint is {folder}/checkpoint-32\.pt"
+        rf"ppo_gru\.py: iteration 4: cannot write to runs/{folder.name}/checkpoint-64\.pt \(File too large\); "
+        rf"the last checkpoint is runs/{folder.name}/checkpoint-32\.pt"
     )
     assert re.fullmatch(said, line), line
     assert [path.name for path in folder.glob("checkpoint*")] == ["checkpoint-32.pt"]
