@@ -85,6 +85,7 @@ def tiny():
     def make(script=ppo_gru, **changes):
         small = {name: size for name, size in SMALL.items() if hasattr(script.Args, name)}
         few = {"num_envs": 4, "num_steps": 16, "num_minibatches": 2, "update_epochs": 2, **small}
+        few["value_init_gain"] = 1.0  # values that are far from 0, so that a test sees what changes them
         return script.Args(**{"cuda": False, "total_timesteps": 128, **few, **changes})
 
     return make

@@ -118,7 +118,9 @@ def test_learning_rates(tiny, monkeypatch):
         rates, step = seen[kind], kind.step
         keep = lambda self, rates=rates, step=step: (rates.append(self.param_groups[0]["lr"]), step(self))  # noqa: E731
         monkeypatch.setattr(kind, "step", keep)
-    ppo_gru.main(tiny(env_id="CueRecall-v0", optimizer="muon", init_lr=0.01, final_lr=0.0, anneal_steps=128))
+    ppo_gru.main(
+        tiny(env_id="CueRecall-v0", optimizer="muon", trunk_size=16, init_lr=0.01, final_lr=0.0, anneal_steps=128)
+    )
     assert seen[torch.optim.AdamW] == [0.01] * 4 + [0.005] * 4
     assert seen[fast.Muon] == pytest.approx([0.03] * 4 + [0.015] * 4)
 
