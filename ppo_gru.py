@@ -47,7 +47,7 @@ from ppo_utils.evaluation import make_agent
 from ppo_utils.fast import Muon, encode, first_occurrences, in_chunks, packed_gru
 from ppo_utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, RunArgs, UnitInterval
 from ppo_utils.infos import add_ended, final_observations, ground_truth_of
-from ppo_utils.logs import mean_logs
+from ppo_utils.logs import mean_logs, policy_metrics
 from ppo_utils.moments import Moments
 from ppo_utils.processes import all_gather, average_gradients
 from ppo_utils.run import Run
@@ -132,16 +132,14 @@ class Args(RunArgs):
 
 
 LAPTOP = {
-    "preset": "laptop",
-    "obs_type": "vector", "hidden_size": 128, "trunk_size": 128,
+    "preset": "laptop", "obs_type": "vector", "hidden_size": 128, "trunk_size": 128,
     "num_envs": 128, "num_steps": 128, "num_minibatches": 16, "update_epochs": 2,
     "norm_reward": True, "gamma": 0.99, "clip_coef": 0.2, "target_kl": 0.05, "max_grad_norm": 0.5,
     "exploration_bonus": "log-barrier", "init_ent_coef": 2e-3, "final_ent_coef": 2e-4,
     "optimizer": "muon", "init_lr": 1e-3, "final_lr": 1e-4, "total_timesteps": 6_000_000, "anneal_steps": None,
 }  # fmt: skip
 QUICKSTART = {
-    **LAPTOP,
-    "preset": "quickstart",
+    **LAPTOP, "preset": "quickstart",
     # Two commands, each shown for one step, and six steps to carry one out.
     "env_options": '{"command_count": [2], "command_show_duration": [1], "command_show_delay": [0], '
     '"explosion_delay": [4], "explosion_duration": [2]}',
@@ -330,7 +328,8 @@ def ppo_loss(
     pg_loss = policy_loss(log_ratio, advantages, args.clip_coef)
     v_loss = value_loss(values, old_values, returns, args.clip_coef if args.clip_vloss else None)
     entropy = sum(branch.entropy() for branch in policy).mean()  # the branches are independent
-    barrier = log_barrier(policy)
+    # Unlike the entropy's, the log-barrier's gradient does not vanish near probability 0 (Agarwal et al., 2021).
+    barrier = sum(branch.logits.mean() for branch in policy)  # a Categorical's logits are log-probabilities
     loss = pg_loss + args.vf_coef * v_loss - ent_coef * (entropy if args.exploration_bonus == "entropy" else barrier)
     logs = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, "log_barrier": barrier}
     if args.auxiliary_detach:
@@ -371,12 +370,11 @@ def clip_gradients(agent: Agent, args: Args) -> Tensor:
 
     With --auxiliary-detach, each auxiliary head is clipped by itself, so that it does not change the agent's step.
     """
-    parameters = {*agent.parameters()}
-    for head in [getattr(agent, name) for name in agent.auxiliary] if args.auxiliary_detach else ():
-        if head is not None:
-            nn.utils.clip_grad_norm_(head.parameters(), args.max_grad_norm)
-            parameters -= {*head.parameters()}
-    return nn.utils.clip_grad_norm_([each for each in agent.parameters() if each in parameters], args.max_grad_norm)
+    groups = defaultdict(list)
+    for name, parameter in agent.named_parameters():
+        part = name.partition(".")[0]
+        groups[part if args.auxiliary_detach and part in agent.auxiliary else "agent"].append(parameter)
+    return {part: nn.utils.clip_grad_norm_(group, args.max_grad_norm) for part, group in groups.items()}["agent"]
 
 
 # ---- 3 PPO ----
@@ -426,28 +424,6 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: f
     return loss.mean()
 
 
-def log_barrier(policy: list[Categorical]) -> Tensor:
-    """Return the mean log-probability over all actions of a branch and over samples, summed over branches.
-
-    It is largest for a uniform policy. Unlike the entropy's, its gradient does not vanish near probability 0 (Agarwal
-    et al., On the Theory of Policy Gradient Methods, 2021).
-    """
-    return sum(branch.logits.mean() for branch in policy)  # a Categorical's logits are normalized
-
-
-@torch.no_grad()
-def policy_metrics(log_ratio: Tensor, clip_coef: float) -> dict[str, Tensor]:
-    """Return what to log of log_ratio (B, A): how far the policy has moved from the rollout's."""
-    deviation = log_ratio.exp() - 1
-    joint = log_ratio.sum(-1)  # the branches are independent: log-ratios add up
-    return {
-        "old_approx_kl": -joint.mean(),
-        "approx_kl": (joint.exp() - 1 - joint).mean(),  # http://joschu.net/blog/kl-approx.html
-        "clipfrac": (deviation.abs() > clip_coef).float().mean(),
-        "ratio_error": deviation.abs().max(),
-    }
-
-
 @dataclass
 class Pieces:
     """Pieces of a rollout: consecutive steps of one environment each. A minibatch consists of whole pieces.
@@ -482,17 +458,14 @@ class Pieces:
         n, t = cuts // num_steps, cuts % num_steps
         return cls(t * num_envs + n, length, num_envs)
 
-    def columns(self) -> Tensor:
-        """Return the column indices 0 .. L - 1 of a padded batch."""
-        return torch.arange(int(self.length.max()))
-
     def is_real(self) -> Tensor:
         """Return the mask (S, L) of a padded batch: true at steps, false at padding."""
-        return self.columns() < self.length[:, None]
+        return torch.arange(int(self.length.max())) < self.length[:, None]
 
     def flat_index(self) -> Tensor:
         """Return the flat indices (B,) of all steps, piece after piece."""
-        return (self.first[:, None] + self.columns() * self.num_envs)[self.is_real()]
+        piece, column = self.is_real().nonzero().unbind(-1)  # (B,) each
+        return self.first[piece] + column * self.num_envs
 
     def pad(self, x: Tensor) -> Tensor:
         """Pad what belongs to the steps, (B, ...), with zeros to the longest piece: (S, L, ...)."""

@@ -59,6 +59,19 @@ def mean_logs(step_logs: list[dict[str, Tensor]], values: Tensor, returns: Tenso
     return {f"losses/{name}": value for name, value in losses.items()} | {"charts/gradient_steps": gradient_steps}
 
 
+@torch.no_grad()
+def policy_metrics(log_ratio: Tensor, clip_coef: float) -> dict[str, Tensor]:
+    """Return what to log of a minibatch's log_ratio (B, A): how far the policy has moved from the rollout's."""
+    deviation = log_ratio.exp() - 1
+    joint = log_ratio.sum(-1)  # the branches are independent: log-ratios add up
+    return {
+        "old_approx_kl": -joint.mean(),
+        "approx_kl": (joint.exp() - 1 - joint).mean(),  # http://joschu.net/blog/kl-approx.html
+        "clipfrac": (deviation.abs() > clip_coef).float().mean(),
+        "ratio_error": deviation.abs().max(),
+    }
+
+
 def explained_variance(values: Tensor, returns: Tensor) -> float:
     """Return the share of the returns' variance that the values explain; NaN if the returns do not vary."""
     variance = returns.var().item()

@@ -31,7 +31,8 @@ ROOT = Path(__file__).parents[1]
 OTHERS = [importlib.import_module(path.stem) for path in sorted(ROOT.glob("ppo_*.py"))]
 OTHERS = [script for script in OTHERS if script not in (ppo_gru, ppo_trxl)]
 SCRIPTS = [ppo_gru, ppo_trxl, *OTHERS]
-SMALL = {"hidden_size": 32, "trxl_dim": 32, "trxl_num_heads": 2, "trxl_num_layers": 2, "trxl_memory_length": 7}
+SMALL = {"trunk_size": 32, "hidden_size": 32, "trxl_dim": 32}
+SMALL |= {"trxl_num_heads": 2, "trxl_num_layers": 2, "trxl_memory_length": 7}
 
 
 @pytest.hookimpl(optionalhook=True)

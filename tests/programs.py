@@ -102,8 +102,9 @@ def run_command(path, *flags, folder=".", **environ):
         return program.wait()
 
 
-def run_together(function, processes=2):
-    """Run a function in several processes that find each other as those of torchrun do; return what each printed."""
+@contextlib.contextmanager
+def together(function, processes=2):
+    """Run a function in several processes that find each other as those of torchrun do."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
@@ -111,5 +112,10 @@ def run_together(function, processes=2):
     with contextlib.ExitStack() as stack:
         ranks = [{"RANK": str(rank), "LOCAL_RANK": str(rank)} for rank in range(processes)]
         sizes = {"WORLD_SIZE": str(processes), "LOCAL_WORLD_SIZE": str(processes)}
-        programs = [stack.enter_context(Program(function, ".", **shared, **sizes, **rank)) for rank in ranks]
+        yield [stack.enter_context(Program(function, ".", **shared, **sizes, **rank)) for rank in ranks]
+
+
+def run_together(function, processes=2):
+    """Run a function in several processes; return what each printed."""
+    with together(function, processes) as programs:
         return [program.wait() for program in programs]

@@ -231,7 +231,7 @@ def test_a_model_of_another_network(tiny):
     path = os.path.join(folder, "model.pt")
     with pytest.raises(ValueError, match=r"model\.pt was trained with --hidden-size 32, not with --hidden-size 64"):
         ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path, hidden_size=64))
-    with pytest.raises(ValueError, match=r"weights of another network, trained with --env-id CueRecall-v0 .*-size 512"):
+    with pytest.raises(ValueError, match=r"weights of another network, trained with --env-id CueRecall-v0 .*-size 32"):
         ppo_gru.setup(tiny(env_id="CueRecall-v0", load_model=path, trunk_size=64))
     saved = {"script": "ppo_gru", "args": asdict(tiny()), "weights": {"memory.rnn.bias_hh_l0": torch.zeros(3)}}
     torch.save(saved, path)

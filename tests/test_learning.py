@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import programs
 import pytest
 import torch
 from conftest import parse_args
@@ -24,6 +25,7 @@ import evaluate
 import learning
 import ppo_gru
 import tables
+from ppo_utils.checkpoints import read_checkpoint
 from ppo_utils.run_logs import SECONDS, RunLog, with_defaults
 from ppo_utils.runs import run_to_end
 from ppo_utils.scores import iqm
@@ -155,6 +157,14 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
 
     def trainings():
         return learning.runs_in(str(config.folder / "runs"), plan)
+
+    def train(config, plan):  # in this process
+        (stopped,) = trainings()
+        ppo_gru.main(parse_args(ppo_gru, "--resume", stopped.path))
+        tqdm.write(f"trained {plan}")
+
+    monkeypatch.setattr(learning, "train", train)
+    monkeypatch.setattr(subprocess, "run", lambda line, **how: programs.run_command(*line[1:], **how["env"]))
 
     assert [learning.is_complete(each) for each in trainings()] == [False]
     assert learning.result_of(config, plan) is None
@@ -345,19 +355,18 @@ def test_hours_of_trainings_are_expected_by_those_that_are_there(tmp_path):
     assert learning.expected_hours(config, plans) == ", about 1.4 hours"  # two million steps, two at a time
 
 
-@pytest.mark.slow
-def test_a_stopped_program_stops_its_trainings_with_a_checkpoint(tmp_path):
-    line = [sys.executable, learning.__file__, "--tasks", "mortar-mayhem", "--agents", "GRU", "--jobs", "1"]
-    with subprocess.Popen([*line, "--folder", "."], cwd=tmp_path, stderr=subprocess.PIPE, text=True) as program:
-        deadline = time.monotonic() + 120
-        while not any("SPS" in log.read_text() for log in tmp_path.glob("*.log")):
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
-        program.terminate()  # to it alone; Ctrl-C is treated as the same, but a shell's background jobs do not get it
-        assert program.stderr.read().endswith("stopped; the same command goes on\n")
-    assert program.returncode == 1
+def test_a_stopped_program_stops_its_trainings_with_a_checkpoint(tmp_path, curves):
+    agent = "GRU --num-envs 4 --num-steps 32 --num-minibatches 2 --eval-levels 1 --checkpoint-interval 1"
+    flags = ["--tasks", "mortar-mayhem", "--agents", agent, "--jobs", "1", "--folder", "."]
+    with programs.Program(programs.command(learning.__file__, *flags), tmp_path) as program:
+        program.wait_until(lambda: [*tmp_path.glob("runs/*/checkpoint-*.pt")])
+        # To it alone. Ctrl-C is treated as the same, but a shell's background jobs do not get it.
+        os.kill(program.pid, signal.SIGTERM)
+        done = program.wait()
+    assert done.returncode == 1
+    assert done.stderr.endswith("stopped; the same command goes on\n")
     (folder,) = tmp_path.glob("runs/*")
-    assert len([*folder.glob("checkpoint-*.pt")]) == 1
+    assert read_checkpoint(folder)["step"] == curves(folder)["losses/loss"][-1][0]
     with (folder / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # nothing trains any more
 

@@ -61,4 +61,4 @@ def test_transformer_memory(tiny, trained, encoding, gate):
 @pytest.mark.slow
 def test_with_bfloat16(tiny, trained):
     """With small heads: products of large matrices take 30 times as long on a processor that has no bfloat16."""
-    assert trained(ppo_trxl, tiny(ppo_trxl, **WINDOW, **SETTINGS, trunk_size=64, amp=True)) >= 0.95
+    assert trained(ppo_trxl, tiny(ppo_trxl, **WINDOW, **SETTINGS, amp=True)) >= 0.95

@@ -8,9 +8,9 @@ import torch
 from torch.distributions import Categorical
 
 import ppo_gru
-from ppo_gru import anneal, normalize, policy_loss, policy_metrics, ppo_loss, value_loss
+from ppo_gru import anneal, normalize, policy_loss, ppo_loss, value_loss
 from ppo_utils import moments
-from ppo_utils.logs import explained_variance, mean_logs
+from ppo_utils.logs import explained_variance, mean_logs, policy_metrics
 
 
 def test_policy_loss_clips_every_branch_by_itself():
@@ -41,22 +41,42 @@ def test_value_loss_is_the_larger_of_clipped_and_unclipped():
     assert value_loss(values, old, returns, None).item() == pytest.approx(1.0)
 
 
-def test_log_barrier_is_a_sum_over_branches_of_means_over_actions():
-    probs = [torch.tensor([[0.5, 0.5], [0.2, 0.8]]), torch.tensor([[0.25, 0.25, 0.5], [0.1, 0.3, 0.6]])]
-    expected = math.log(0.5 * 0.5 * 0.2 * 0.8) / 4 + math.log(0.25 * 0.25 * 0.5 * 0.1 * 0.3 * 0.6) / 6
-    assert ppo_gru.log_barrier([Categorical(probs=p) for p in probs]).item() == pytest.approx(expected)
+@pytest.fixture
+def barrier_loss(played, monkeypatch):
+    """The loss and its logs of a policy, of which only the log-barrier's part is not zero."""
+
+    def loss_of(policy, ent_coef=1.0):
+        args, run, *_ = played(env_id="CueRecall-v0", vf_coef=0.0, exploration_bonus="log-barrier")
+        steps, log_probs = run.rollout.values.numel(), run.rollout.log_probs.flatten(0, 1)
+        policy = [Categorical(logits=branch.logits.expand(steps, -1)) for branch in policy]
+        recomputed = policy, log_probs, run.rollout.values.flatten(), torch.zeros(steps, 1)
+        monkeypatch.setattr(run.agent, "evaluate_actions", lambda *_: recomputed)
+        pieces = run.agent.memory.cut(run.rollout.done)
+        run.rollout.returns = run.rollout.values
+        run.rollout.advantages = torch.zeros_like(run.rollout.values)
+        return ppo_loss(run.agent, run.rollout, pieces, ent_coef, args)
+
+    return loss_of
 
 
-def test_only_the_log_barrier_brings_back_an_action_whose_probability_is_zero():
+def test_log_barrier_is_a_sum_over_branches_of_means_over_actions(barrier_loss):
+    policy = [Categorical(probs=torch.tensor(probs)) for probs in ([0.2, 0.8], [0.1, 0.3, 0.6])]
+    expected = math.log(0.2 * 0.8) / 2 + math.log(0.1 * 0.3 * 0.6) / 3
+    loss, logs = barrier_loss(policy, ent_coef=5.0)
+    assert logs["log_barrier"].item() == pytest.approx(expected)
+    assert loss.item() == pytest.approx(-5.0 * expected)
+
+
+def test_only_the_log_barrier_brings_back_an_action_whose_probability_is_zero(barrier_loss):
     """With logits 40 apart, no gradient of the surrogate or of the entropy is left; the barrier's is 1/3 - p."""
-    logits = torch.tensor([[40.0, 0.0, 0.0]], requires_grad=True)
-    policy, taken = Categorical(logits=logits), torch.tensor([0])
-    surrogate = policy_loss(policy.log_prob(taken)[:, None], torch.tensor([-1.0]), 0.2)
-    for objective in (surrogate, policy.entropy().sum()):
+    logits = torch.tensor([40.0, 0.0, 0.0], requires_grad=True)
+    policy, taken = Categorical(logits=logits), torch.tensor(0)
+    surrogate = policy_loss(policy.log_prob(taken)[None, None], torch.tensor([-1.0]), 0.2)
+    for objective in (surrogate, policy.entropy()):
         (gradient,) = torch.autograd.grad(objective, logits, retain_graph=True)
         assert gradient.abs().max() < 1e-15
-    (gradient,) = torch.autograd.grad(ppo_gru.log_barrier([policy]), logits)
-    torch.testing.assert_close(gradient, torch.tensor([[1 / 3 - 1, 1 / 3, 1 / 3]]))
+    (gradient,) = torch.autograd.grad(barrier_loss([policy])[0], logits)
+    torch.testing.assert_close(-gradient, torch.tensor([1 / 3 - 1, 1 / 3, 1 / 3]))
 
 
 @pytest.mark.parametrize(("step", "expected"), [(0, 1.0), (50, 0.6), (100, 0.2), (1000, 0.2)])

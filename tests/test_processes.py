@@ -57,8 +57,8 @@ close(run)
 """
 
 
-def torchrun(*command, processes=2):
-    return [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}", *command]
+def torchrun(*command):
+    return [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", *command]
 
 
 def train_together(path, *flags):
@@ -141,10 +141,8 @@ from ppo_utils.runs import parse_args
 ppo_gru.main(parse_args(ppo_gru.Args, ppo_gru.PRESETS, sys.argv[1:]))
 print([name for task in Path("/proc/self/task").iterdir() if "gloo" in (name := (task / "comm").read_text())])
 """)
-    line = torchrun("threads.py", *flags_of(ppo_gru), "--total-timesteps", "128")
-    environment = {**os.environ, "PYTHONPATH": str(Path(ppo_gru.__file__).parent)}
-    found = subprocess.run(line, check=True, timeout=300, capture_output=True, text=True, env=environment)
-    assert re.findall(r"\[.*?\]", found.stdout) == ["[]", "[]"]
+    done = train_together("threads.py", *flags_of(ppo_gru), "--total-timesteps", "128")
+    assert [re.findall(r"\[.*?\]", each.stdout) for each in done] == [["[]"], ["[]"]]
 
 
 def test_processes_play_shares_of_the_lanes_of_one(tiny, monkeypatch):
@@ -211,45 +209,41 @@ def test_a_resumed_run_is_the_unstopped_one(curves):
     assert not states[0]["torch"].equal(states[1]["torch"]), "they choose other actions"
 
 
-def started(command):
-    """Start a training and wait for its first checkpoint; return the process."""
-    process = subprocess.Popen(torchrun(*command), stderr=subprocess.PIPE, text=True, start_new_session=True)
-    deadline = time.monotonic() + 200
-    while not list(Path("runs").glob("*/checkpoint-*.pt")):
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-    return process
+ENDLESS = [ppo_gru.__file__, *flags_of(ppo_gru, **{"total-timesteps": 10**8, "checkpoint-interval": 1})]
 
 
-def workers(process):
-    """Return the ids of torchrun's processes, in the order of ranks."""
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    return sorted(int(child) for child in children if "ppo_gru" in Path(f"/proc/{child}/cmdline").read_text())
+def has_checkpoint():
+    """Whether training has begun."""
+    return list(Path("runs").glob("*/checkpoint-*.pt"))
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the processes in /proc")
 def test_a_process_that_dies_ends_the_others():
-    command = [ppo_gru.__file__, *flags_of(ppo_gru, **{"total-timesteps": 10**8, "checkpoint-interval": 1})]
-    process = started(command)
-    os.kill(workers(process)[1], signal.SIGKILL)
-    said = process.communicate(timeout=60)[1]
-    assert process.returncode != 0
-    assert "exitcode  : -9" in said, "torchrun says which one ended"
+    with programs.together(programs.command(*ENDLESS)) as (first, second):
+        first.wait_until(has_checkpoint)
+        os.kill(second.pid, signal.SIGKILL)
+        done = first.wait(60)
+    assert done.returncode == 1
     (folder,) = Path("runs").iterdir()
     assert read_checkpoint(folder)["step"] > 0
     message = r"ppo_gru\.py: iteration \d+: another process of this run has ended; .*; the last checkpoint is \S+\.pt"
-    assert re.search(message, said), said
+    assert re.search(message, done.stderr), done.stderr
+
+
+def workers(process):
+    """Return the ids of torchrun's processes."""
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return [int(child) for child in children if "ppo_gru" in Path(f"/proc/{child}/cmdline").read_text()]
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the processes in /proc")
 def test_a_signal_to_torchrun(curves):
     """As a cluster sends it: to torchrun, which passes it on, and perhaps to all processes too."""
-    # Its first checkpoint tells that training has begun.
-    command = [ppo_gru.__file__, *flags_of(ppo_gru, **{"total-timesteps": 10**8, "checkpoint-interval": 1})]
-    process = started(command)
-    deadline = threading.Timer(100, process.kill)
+    process = subprocess.Popen(torchrun(*ENDLESS), stderr=subprocess.PIPE, text=True, start_new_session=True)
+    deadline = threading.Timer(300, process.kill)
     deadline.start()
+    while not has_checkpoint():
+        assert process.poll() is None
+        time.sleep(0.1)
     for each in [*workers(process), process.pid]:
         os.kill(each, signal.SIGTERM)
     said = process.communicate()[1]

@@ -127,7 +127,7 @@ def test_a_resumed_run_is_the_unstopped_one(tiny, curves, monkeypatch, name):
     changes = dict(RUNS[name])
     script = changes.pop("script", ppo_gru)
     few = {"total_timesteps": 4 * 64, "checkpoint_interval": 2, "num_levels": 50}
-    args = tiny(script, **few, trunk_size=32, seed=3, **changes)  # small, since Muon's bfloat16 is slow on a processor
+    args = tiny(script, **few, seed=3, **changes)
     folder = copied_after(monkeypatch, 2 * 64)
     whole = curves(script.main(args))
     assert {step for step, _ in curves(folder)["losses/loss"]} == {64, 128}

@@ -116,7 +116,7 @@ PAIRS = [*(("CartPole-v1", memory) for memory in MEMORIES), *zip(2 * OTHER_ENVS,
 @pytest.mark.parametrize(("env_id", "memory"), PAIRS)
 def test_trains(tiny, scalars, env_id, memory):
     script = memory.get("script", ppo_gru)
-    curves = scalars(script.main(tiny(env_id=env_id, num_steps=32, total_timesteps=256, trunk_size=32, **memory)))
+    curves = scalars(script.main(tiny(env_id=env_id, num_steps=32, total_timesteps=256, **memory)))
     assert curves.keys() >= CURVES
     assert all(math.isfinite(value) for name in CURVES for value in curves[name])
     assert all(error < 1e-5 for error in curves["losses/ratio_error"])
