@@ -1,6 +1,7 @@
 """Flags of the scripts: their types with bounds, their spelling, and the checks that need no environment."""
 
 import contextlib
+import functools
 import shlex
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
@@ -12,6 +13,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from ppo_utils.processes import rank_and_size
 
+type_hints = functools.cache(get_type_hints)  # a program that plans hundreds of trainings asks for each
 LARGEST = 3.4e38  # of weights: in float32, what is larger is infinite
 
 
@@ -140,7 +142,7 @@ def as_flags(values: dict[str, Any]) -> str:
 
 def check_bounds(args: RunArgs) -> None:
     """Raise ValueError, naming the flag and what it may be, for a dataclass' first number that is out of bounds."""
-    for name, kind in get_type_hints(type(args), include_extras=True).items():
+    for name, kind in type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
         for part in (kind, *get_args(kind)):  # float | None has its bounds in a part
             bounds = next((each for each in getattr(part, "__metadata__", ()) if isinstance(each, Bounds)), None)
@@ -156,8 +158,8 @@ def check_args(args: RunArgs) -> None:
 
     An integer that is given for a float in Python becomes one, so that logs spell both alike.
     """
-    plain = get_type_hints(type(args))
-    for name, kind in get_type_hints(type(args), include_extras=True).items():
+    plain = type_hints(type(args))
+    for name, kind in type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
         is_choice = get_origin(kind) is Literal
         kinds = (str,) if is_choice else get_args(plain[name]) or (plain[name],)  # float | None has two

@@ -79,7 +79,8 @@ def test_ratio_is_one_for_every_sample(played, env_id, memory):
 
 @each_memory(MEMORIES)
 def test_ratio_is_nearly_one_in_bfloat16(played, memory):
-    _, run, *_ = played(iterations=3, weights_scale=3.0, env_id="MortarMayhemB-Grid-v0", amp=True, **memory)
+    changes = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector", "amp": True}
+    _, run, *_ = played(iterations=3, weights_scale=3.0, **changes, **memory)
     with torch.autocast("cpu", torch.bfloat16):
         _, ratio, values = recompute(run)
     assert (ratio - 1).abs().max() < 5e-2
@@ -261,14 +262,14 @@ def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(pl
     changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"explosion_delay": [1000]}'}
     args, run, *_ = played(script=ppo_trxl, num_envs=1, num_steps=50, num_minibatches=1, **changes)
     # As if the episode had been going on for long; its window is still that of 50 steps.
-    run.carry.memory["episode_step"] += 4050
+    run.carry.memory["episode_step"] += 4900
 
     def storage():
         state = run.rollout.memory
         return [part.shape for part in (*state.keys, *state.values, state.hidden, state.row_step)]
 
     before = storage()
-    for _ in range(19):
+    for _ in range(3):
         collect(ppo_trxl, run, args)
         assert recompute(run)[1].sub(1).abs().max() < 1e-5
     assert run.rollout.memory.episode_step > 5000
@@ -418,7 +419,7 @@ def test_acting_and_learning_ask_no_device_for_numbers(played, monkeypatch, memo
 REFRESHED = {
     "terminated": {"env_id": "CueRecall-v0"},
     "truncated": {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"max_steps": 5}', "obs_type": "vector"},
-    "neither": {"env_id": "Endless-MortarMayhem-v0"},
+    "neither": {"env_id": "Endless-MortarMayhem-v0", "obs_type": "vector"},
 }
 
 
@@ -470,7 +471,8 @@ def test_a_refreshed_memory_is_that_of_a_rollout_with_the_present_weights(played
             wanted.append(value)
             agent.memory.reset(state, rollout.terminated[t] | rollout.truncated[t])
     index, _, values = recompute(run)
-    torch.testing.assert_close(values, torch.stack(wanted).flatten()[index], rtol=0, atol=1e-5)
+    wanted = torch.stack(wanted).flatten()[index]
+    assert (values - wanted).abs().max() < 1e-5 * wanted.abs().max().clamp(min=1)
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

@@ -130,7 +130,7 @@ def naive(memory, x, row, lane, stored, own=None):
 
 VARIANTS = [
     {"trxl_positional_encoding": encoding, "trxl_gate": gate, "trxl_memory_length": window}
-    for encoding, gate, window in itertools.product(ENCODINGS, ["none", "gru"], [1, 5, 13, 40])
+    for encoding, (gate, window) in itertools.product(ENCODINGS, [("none", 1), ("gru", 5), ("gru", 13), ("none", 40)])
 ] + [
     {"trxl_positional_encoding": encoding, **changes}
     for encoding in ENCODINGS
