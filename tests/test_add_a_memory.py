@@ -51,7 +51,7 @@ def test_the_memory_of_the_page(tmp_path):
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    few = ["--seeds", "1", "--steps", "1e4", "--evaluations", "1", "--test-levels", "5"]
+    few = ["--seeds", "1", "--steps", "2e4", "--evaluations", "1", "--test-levels", "5"]
     tasks = ("--tasks", "mortar-mayhem", "--agents", "ppo_mingru.py")
     assert "\n| ppo_mingru.py | 0." in python("benchmarks/learning.py", *tasks, *few)
     (model,) = tmp_path.glob("learning/runs/*/model.pt")
