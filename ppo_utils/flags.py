@@ -170,6 +170,8 @@ def check_args(args: RunArgs) -> None:
             setattr(args, name, value)
         if type(value) not in kinds:
             raise ValueError(f"{flag(name)} is {value!r}; it must be of type {kinds[0].__name__}")
+        if isinstance(value, str) and value != value.encode(errors="replace").decode():
+            raise ValueError(f"{flag(name)} is {value!r}, no UTF-8 text; start Python with -X utf8")
         if is_choice and value not in get_args(kind):
             raise ValueError(f"{flag(name)} is {value!r}; it must be one of {', '.join(get_args(kind))}")
     check_bounds(args)

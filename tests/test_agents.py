@@ -26,7 +26,7 @@ def test_the_table_has_all_agents():
 @pytest.mark.parametrize(("name", "metric", "score", "flags"), ROWS, ids=[row[0] for row in ROWS])
 def test_an_agent_plays_as_well_as_published(name, metric, score, flags):
     checkpoint = evaluate.Checkpoint.read(str(AGENTS / name))
-    few = 50 if "endless" in name else 150  # of the 1,000 test levels; endless episodes are long
+    few = 30 if "endless" in name else 150  # of the 1,000 test levels; endless episodes are long
     levels = evaluate.Config(start_level=learning.FIRST_TEST_LEVEL, levels=few, repeats=1)
     scores = evaluate.play(checkpoint, levels)[metric]  # (M, E)
     # Within four standard errors of fewer levels and, with other roundings, other actions.

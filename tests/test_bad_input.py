@@ -51,6 +51,7 @@ CASES = {
     "--num-minibatches 200 --seq-len 100": "may have only 163 sequences",
     "--seed 99999999999999999999": r"--seed is 99999999999999999999; it must be below 2 \*\* 63",
     "--exp-name ../up": "--exp-name is '../up'; it must be a name without slashes",
+    "--exp-name gr\udcc3\udcb6sse": "--exp-name is .*, no UTF-8 text; start Python with -X utf8",
     "--env-id CueRecall-v0 --capture-video": "needs an environment that draws images .*; CueRecall-v0 draws none",
     "--target-kl nan": "--target-kl is nan; it must be above 0",
     "--vf-coef inf": r"--vf-coef is inf; it must be 0 or more and at most 3\.4e\+38, where float32 ends",

@@ -69,8 +69,8 @@ def normed(layer, x):
     """What a layer norm makes of x (..., D), or x where there is none."""
     if isinstance(layer, torch.nn.Identity):
         return x
-    deviation = (x.var(-1, correction=0, keepdim=True) + 1e-5).sqrt()
-    return (x - x.mean(-1, keepdim=True)) / deviation * layer.weight + layer.bias
+    x = x - x.mean(-1, keepdim=True)
+    return x / (x.square().mean(-1, keepdim=True) + 1e-5).sqrt() * layer.weight + layer.bias
 
 
 def merged(merge, x, y):
