@@ -138,6 +138,15 @@ def test_an_episode_is_an_environment_s_first(played):
     assert found["finished"].tolist() == [1, 1, 1, 0, 0]
 
 
+@pytest.mark.parametrize("amp", [True, False])
+def test_an_evaluation_computes_as_the_training_does(played, amp):
+    args, run, *_ = played(env_id="CueRecall-v0", amp=amp, eval_levels=1)
+    used = []
+    run.agent.encoder.register_forward_pre_hook(lambda *_: used.append(torch.is_autocast_enabled("cpu")))
+    evaluation.level_scores(args, run.agent, envs_for(args, 3))
+    assert {*used} == {amp}
+
+
 def test_what_is_logged_of_an_evaluation(tiny, curves, monkeypatch):
     """Levels by repeats, and the mean; what some episode did not report is left out."""
     numbers = np.arange(6.0)
