@@ -167,11 +167,11 @@ def test_initialization_of_recurrent_layers(memory):
 
 
 def test_initialization_of_the_network():
-    """Gains: square root of 2, 0.1 for the policy's last layer, 0.01 for the value's; biases are 0."""
+    """Gains: square root of 2, 0.1 for the policy's last layer, 1 for the value's; biases are 0."""
     torch.manual_seed(0)
     agent = Agent(PIXELS, [4], Args())
     gains = {agent.encoder.embedding: 2, agent.heads.trunk: 2, agent.heads.policy[0]: 2, agent.heads.policy[2]: 0.01}
-    for layer, square in {**gains, agent.heads.value[0]: 2, agent.heads.value[2]: 1e-4}.items():
+    for layer, square in {**gains, agent.heads.value[0]: 2, agent.heads.value[2]: 1}.items():
         weight = layer.weight if layer.weight.shape[0] <= layer.weight.shape[1] else layer.weight.T
         torch.testing.assert_close(weight @ weight.T, square * torch.eye(len(weight)), atol=1e-4, rtol=0)
         assert layer.bias.eq(0).all()
