@@ -54,6 +54,13 @@ def test_levels_follow_the_training_set(tiny):
     assert min(levels) == defaults.start_level + defaults.num_levels == 100_000
 
 
+def test_levels_that_were_trained_on(tiny):
+    """Of levels 5 to 14."""
+    args = tiny(env_id="MysteryPath-Grid-v0", **FEW)
+    ranges = {(4, 2): True, (3, 2): False, (14, 1): True, (15, 3): False, (0, 30): True}
+    assert {each: evaluation.are_trained_on(args, *each) for each in ranges} == ranges
+
+
 @EACH_SCRIPT
 def test_a_lane_plays_its_level_once(played, script, monkeypatch):
     """The same actions in single environments with the levels' seeds earn the same."""

@@ -139,6 +139,13 @@ def test_trains_on_vectors_and_their_frequencies(tiny, scalars):
     assert saved_args(ppo_gru.Args, read_model(path)).vector_frequencies == 0
 
 
+def test_a_newer_flag_keeps_its_value():
+    """A former default is for files that are older than the flag."""
+    saved = {"args": {"value_init_gain": 0.25}}
+    assert saved_args(ppo_trxl.Args, saved).value_init_gain == 0.25
+    assert saved_args(ppo_trxl.Args, {"args": {}}).value_init_gain == 1.0
+
+
 def test_flags_that_were_renamed(tiny):
     """An older file has them by their former names."""
     args = {"head_size": 7, "seed": 3, "no_longer": 1}
