@@ -103,7 +103,7 @@ def code_of(page):
 def test_a_step_is_exported_as_documented(trained, script, changes, monkeypatch):
     """Over 20 steps of two episodes, a window of 7 included: the agent's own logits and values, to 1e-6."""
     (_, load, gru, trxl, export) = code_of("docs/agents.md")
-    names = {"path": str(trained(script, 1, env_id="MysteryPath-Grid-v0", **changes))}
+    names = {"path": str(trained(script, 1, env_id="MysteryPath-Grid-v0", value_init_gain=0.5, **changes))}
     exec("\n".join([load, gru if script is ppo_gru else trxl, export]), names)
     agent, step, state = names["player"].agent, names["exported"].module(), names["beginning"]
     memory = agent.memory.begin_rollout(agent.memory.initial(1, torch.device("cpu")), 64)
@@ -117,8 +117,8 @@ def test_a_step_is_exported_as_documented(trained, script, changes, monkeypatch)
             policy, value, _ = agent.heads(y)
             found_logits, found_value, *state = step(obs, *state)
         for found_branch, branch in zip(found_logits, policy, strict=True):
-            assert found_branch == pytest.approx(branch.logits, rel=1e-6, abs=1e-6), t
-        assert found_value == pytest.approx(value, rel=1e-6, abs=1e-6), t
+            assert found_branch == pytest.approx(branch.logits, abs=1e-6), t
+        assert found_value == pytest.approx(value, abs=1e-6), t
         obs, *_ = envs.step(np.array([[t % 4]]))
         if t == 25:  # a new episode: the state begins as it did
             agent.memory.reset(memory, torch.tensor([True]))
