@@ -64,7 +64,7 @@ def saved(tiny):
     return save
 
 
-def played(seed=3, max_steps=60, env_options=None):
+def played(seed=3, max_steps=30, env_options=None):
     agent, envs, _ = enjoy.load("model.pt", env_options)
     return enjoy.play(agent, envs, seed, max_steps)
 
@@ -75,7 +75,7 @@ def data_of(page):
 
 def page_of(**config):
     """What the page of this command holds."""
-    enjoy.main(enjoy.Config(**{"checkpoint": "model.pt", "seed": 3, "max_steps": 60, **config}))
+    enjoy.main(enjoy.Config(**{"checkpoint": "model.pt", "seed": 3, "max_steps": 30, **config}))
     return data_of(Path("page.html").read_text())
 
 
@@ -111,7 +111,7 @@ def frames_of(video):
 def test_every_kind_of_agent(name, saved):
     script, changes = AGENTS[name]
     args = saved(script, **changes)
-    line = enjoy.main(enjoy.Config("model.pt", seed=3, max_steps=60))
+    line = enjoy.main(enjoy.Config("model.pt", seed=3, max_steps=30))
     (page,) = data_of(Path("page.html").read_text())["episodes"]
     steps = page["steps"]
     assert line.startswith(f"page.html: {steps} steps, return {page['facts']['return']}, ")
@@ -372,11 +372,11 @@ def test_an_agent_trained_in_processes_plays_in_this_one(saved):
 def test_agents_and_levels(saved):
     saved(num_levels=5)
     saved(ppo_trxl, "other.pt", num_levels=7)
-    page = page_of(others=("other.pt", "model.pt"), levels=2, seed=None)
+    page = page_of(others=("other.pt", "model.pt"), levels=2, seed=None, max_steps=5)
     facts = [(each["facts"]["agent"].split("/")[1], each["facts"]["seed"]) for each in page["episodes"]]
     assert facts == [("model.pt", 7), ("other.pt", 7), ("model.pt", 8), ("other.pt", 8)]
     for each, (name, seed) in zip(page["episodes"], facts, strict=True):
-        (alone,) = page_of(checkpoint=name, seed=seed)["episodes"]
+        (alone,) = page_of(checkpoint=name, seed=seed, max_steps=5)["episodes"]
         assert alone == each
 
 
@@ -488,9 +488,9 @@ def test_a_thousand_steps_stay_small(saved):
     options = '{"agent_health": 1000000, "steps_per_coin": 1000000}'
     window = {"trxl_memory_length": 256, "trxl_num_layers": 3, "reconstruction_coef": 0.1}
     saved(ppo_trxl, env_id="Endless-SearingSpotlights-v0", env_options=options, **window)
-    assert enjoy.main(enjoy.Config("model.pt", seed=3, max_steps=100)).startswith("page.html: 100 steps")
+    assert enjoy.main(enjoy.Config("model.pt", seed=3, max_steps=40)).startswith("page.html: 40 steps")
     library, longest_look = len(enjoy.get_plotlyjs()), 3 * 4 * 256 * 4 / 3  # three blocks, four heads, in base64
-    assert library + 10 * (os.path.getsize("page.html") - library) + 1000 * longest_look < 15e6
+    assert library + 25 * (os.path.getsize("page.html") - library) + 1000 * longest_look < 15e6
 
 
 # ---- in a browser ----

@@ -1,0 +1,65 @@
+"""What the pages say of the results in the repository: the commands beside it print it."""
+
+import functools
+import os
+import re
+import shlex
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import tyro
+
+import claims
+import learning
+import tables
+import tuning
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def read_once():
+    """Read each of the files once: the pages are of the same ones."""
+    with pytest.MonkeyPatch.context() as patch:
+        read = functools.cache(learning.read_run)
+        for program in (learning, tuning):
+            patch.setattr(program, "read_run", lambda path: read(os.path.realpath(path)))
+        yield
+
+
+def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_path, monkeypatch, capsys):
+    """All tables by those of their section, all scores with a decimal point by any."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(tables, "draw", lambda *args: None)
+    page = Path("docs/results.md").read_text()
+    fence = re.compile(r"^```\n(.*?)^```\n", re.MULTILINE | re.DOTALL)
+    printed, rows = "", 0
+    for section in re.split("^##+ ", page, flags=re.MULTILINE):
+        for call in " ".join(fence.findall(section.replace("\\\n", " "))).split("python benchmarks/learning.py")[1:]:
+            config = tyro.cli(learning.Config, args=shlex.split(call))
+            learning.main(replace(config, report=True, out=tmp_path / "curves.png"))
+        here = capsys.readouterr().out
+        lines = [line for line in section.splitlines() if line.startswith("|")]
+        assert [line for line in lines if line not in here.splitlines()] == []
+        printed, rows = printed + here, rows + len(lines)
+    assert rows > 30
+    text = re.sub("`--[^`]*`", "", fence.sub("", page)).replace("p < 0.05", "")  # without the values of flags
+    numbers = set(re.findall(r"(?<![\d.])\d+\.\d+(?![\d.])", text))
+    assert numbers <= set(re.findall(r"\d+\.\d+", printed))
+    scores = re.findall(r"\d+\.\d+ ± \d+\.\d+", (ROOT / "README.md").read_text())
+    assert len(scores) > 10
+    assert [score for score in scores if score not in printed] == []
+
+
+def test_the_table_of_minutes_is_printed_by_its_command(capsys):
+    tuning.main(tuning.Config())
+    assert capsys.readouterr().out in (ROOT / "docs/tuning.md").read_text()
+
+
+def test_the_page_ends_with_the_tables_of_the_results_that_are_there(capsys):
+    claims.main(claims.Config(report=True, results=ROOT / "benchmarks/results"))
+    assert (ROOT / "docs/claims.md").read_text().endswith(capsys.readouterr().out)
+    for claim in claims.CLAIMS.values():  # whose command lines have been parsed by now
+        plans = [plan for agent in claim.agents for plan in claim.plans(claims.Config(seeds=(1,)), agent)]
+        assert len({tuple(plan.logged_args().items()) for plan in plans}) == len(plans), "no two are the same"
