@@ -10,6 +10,9 @@ import sys
 import tempfile
 import time
 import traceback
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 class Program:
@@ -92,6 +95,36 @@ def command(path, *flags):
     def run():
         sys.argv = [str(path), *map(str, flags)]
         runpy.run_path(str(path), run_name="__main__")
+
+    return run
+
+
+def module(name, *flags):
+    """Return a function that does what `python -m name flags` does."""
+
+    def run():
+        sys.argv = [name, *map(str, flags)]
+        runpy.run_module(name, run_name="__main__", alter_sys=True)
+
+    return run
+
+
+def elsewhere(function, *folders, anew=()):
+    """Return a function that does the same where this repository is not: its modules are those in the folders.
+
+    Imported again are the repository's modules, and those of the packages named in `anew`.
+    """
+
+    def run():
+        sys.path[:] = [
+            *map(str, folders),
+            *(path for path in sys.path if not Path(path).resolve().is_relative_to(ROOT)),
+        ]
+        for name, each in list(sys.modules.items()):
+            file = getattr(each, "__file__", None)
+            if name.partition(".")[0] in anew or (file and Path(file).resolve().is_relative_to(ROOT)):
+                del sys.modules[name]
+        function()
 
     return run
 

@@ -1,13 +1,12 @@
 """docs/add_a_memory.md: who follows it has a script that passes the suite and trains."""
 
-import os
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
-from programs import run_command
+import pytest
+from programs import Program, command, elsewhere
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/add_a_memory.md").read_text()
@@ -39,20 +38,25 @@ def follow(folder):
 def test_the_memory_of_the_page(tmp_path):
     follow(tmp_path)
 
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider"]
-    command += ["tests/test_memory.py", "tests/test_resume.py", "-k", "mingru"]
-    environ = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert int(re.search(r"(\d+) passed", done.stdout).group(1)) >= 19
-
-    def python(path, *flags):
-        done = run_command(tmp_path / path, *flags, folder=tmp_path, PYTHONPATH=str(tmp_path))
+    def said(function):
+        """What a program prints that has its modules from the copy alone."""
+        with Program(
+            elsewhere(function, tmp_path, tmp_path / "benchmarks"), tmp_path, PYTHONPATH=str(tmp_path)
+        ) as program:
+            done = program.wait()
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    few = ["--seeds", "1", "--steps", "2e4", "--evaluations", "1", "--test-levels", "5"]
-    tasks = ("--tasks", "mortar-mayhem", "--agents", "ppo_mingru.py")
-    assert "\n| ppo_mingru.py | 0." in python("benchmarks/learning.py", *tasks, *few)
+    files = ["tests/test_memory.py", "tests/test_resume.py"]
+    tests = said(lambda: sys.exit(pytest.main(["-p", "no:cacheprovider", *files, "-k", "mingru"])))
+    assert int(re.search(r"(\d+) passed", tests).group(1)) >= 19
+
+    few = ["--seeds", "1", "--steps", "1024", "--evaluations", "1", "--test-levels", "5"]
+    agent = "ppo_mingru.py --num-envs 16 --num-steps 64 --eval-levels 2"
+    tasks = ("--tasks", "mortar-mayhem", "--agents", agent)
+    assert "\n| ppo_mingru.py, num envs 16, num steps 64, eval levels 2 | 0." in said(
+        command(tmp_path / "benchmarks/learning.py", *tasks, *few)
+    )
     (model,) = tmp_path.glob("learning/runs/*/model.pt")
-    assert "| ppo_mingru-py | 1 |" in python("evaluate.py", str(model), "--levels", "1", "--repeats", "1")
+    scores = said(command(tmp_path / "evaluate.py", model, "--levels", "1", "--repeats", "1"))
+    assert re.search(r"\| ppo_mingru-py\S* \| 1 \|", scores)

@@ -7,6 +7,7 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
+from programs import Program, elsewhere, module
 
 ROOT = Path(__file__).parents[1]
 ENVS = ROOT / "memory_gym_envs"
@@ -94,12 +95,18 @@ def test_the_whole_repository_leaves_common_names_free(whole):
 
 def test_a_training_of_an_installed_script_ends_with_commands_that_work(whole, tmp_path):
     whole.extractall(tmp_path)
+
+    def run_module(option, name, *flags):
+        assert option == "-m"
+        with Program(elsewhere(module(name, *flags), tmp_path), tmp_path) as program:
+            return program.wait()
+
     few = "--preset quickstart --num-envs 8 --num-steps 16 --total-timesteps 128 --save-model --no-cuda"
-    done = run(tmp_path, "-m", "ppo_gru", *few.split())
+    done = run_module("-m", "ppo_gru", *few.split())
     commands = dict(line.split(": python ") for line in done.stdout.splitlines() if ": python " in line)
     assert set(commands) == {"evaluate", "watch"}, done.stderr
     for command in commands.values():
-        done = run(tmp_path, *command.split())
+        done = run_module(*command.split())
         assert done.returncode == 0, done.stderr
 
 

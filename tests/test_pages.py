@@ -1,13 +1,12 @@
 """The pages that programs make are what the programs make today."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from programs import run_command
 
 from memory_gym_envs import FAMILIES
 from pictures import LABEL
@@ -18,8 +17,7 @@ ROOT = Path(__file__).parents[1]
 @pytest.mark.parametrize("name", ["options", "vectors"])
 def test_page(name):
     program = ROOT / f"benchmarks/{name}_page.py"
-    made = subprocess.run([sys.executable, program], capture_output=True, text=True, check=True)
-    assert made.stdout == (ROOT / f"docs/{name}.md").read_text()
+    assert run_command(program).stdout == (ROOT / f"docs/{name}.md").read_text()
 
 
 @pytest.mark.parametrize(("env_id", "variant"), [row for family in FAMILIES for row in family.variants.items()])
@@ -32,7 +30,7 @@ def test_page_has_every_default(env_id, variant):
 
 
 def test_pictures(tmp_path):
-    subprocess.run([sys.executable, ROOT / "benchmarks/pictures.py", tmp_path], check=True)
+    assert run_command(ROOT / "benchmarks/pictures.py", tmp_path).returncode == 0
     for family in ("mortar_mayhem", "mystery_path", "searing_spotlights"):
         made, shown = (np.asarray(Image.open(folder / f"{family}.png")) for folder in (tmp_path, ROOT / "docs"))
         assert made.shape == shown.shape

@@ -4,8 +4,10 @@ import os
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import pytest
+from programs import Program
 
 import ppo_gru
 from ppo_utils import runs, terminal
@@ -66,8 +68,10 @@ def test_a_training_whose_last_lines_nobody_reads(monkeypatch, tiny):
 
 def test_a_runner_that_executes_the_text():
     """`python -m cProfile` does, whose own names `__main__` has before Python 3.12."""
-    code = "import sys; path = sys.argv.pop(1); names = {'__name__': '__main__', '__file__': path}; "
-    code += "exec(compile(open(path).read(), path, 'exec'), names)"
-    command = [sys.executable, "-c", code, ppo_gru.__file__, "--env-id", "CartPole-v99"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
-    assert done.stderr.startswith("-c: there is no environment CartPole-v99")
+
+    def runner():
+        sys.argv, path = ["runner.py", "--env-id", "CartPole-v99"], ppo_gru.__file__
+        exec(compile(Path(path).read_text(), path, "exec"), {"__name__": "__main__", "__file__": path})
+
+    with Program(runner) as program:
+        assert program.wait().stderr.startswith("runner.py: there is no environment CartPole-v99")

@@ -345,8 +345,9 @@ def holes(perturbed, plain, opacity, shade):
     return clear
 
 
-@pytest.mark.parametrize(("opacity", "shade"), [(120, 255), (255, 0), (200, 90)])
-@EACH_SHORT
+@pytest.mark.parametrize(
+    ("env_id", "opacity", "shade"), [(SHORT[0], 120, 255), (SHORT[0], 255, 0), (SHORT[1], 200, 90)]
+)
 def test_veil_with_holes(env_id, opacity, shade):
     envs, bare, ended = SpotlightPerturbation(make(env_id), opacity, shade), make(env_id), 0
     left, right = envs.reset(seed=0)[0], bare.reset(seed=0)[0]
