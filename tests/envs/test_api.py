@@ -42,7 +42,7 @@ def test_spaces(env_id, obs_type):
     assert envs.single_action_space == env.action_space
     assert envs.single_observation_space == env.observation_space
     assert envs.reset(seed=0)[0] in envs.observation_space
-    for observations, rewards, terminated, truncated, _ in roll(envs, 130):
+    for observations, rewards, terminated, truncated, _ in roll(envs, 60):
         assert observations in envs.observation_space
         assert (rewards.dtype, terminated.dtype, truncated.dtype) == (np.float64, np.bool_, np.bool_)
         assert rewards.shape == terminated.shape == truncated.shape == (LANES,)

@@ -29,8 +29,8 @@ def test_next_step_is_gymnasiums(env_id, obs_type):
     ours, theirs = both(env_id, NEXT, obs_type=obs_type, **LEVELS[obs_type])
     resets = [
         (11, HASTY[FAMILY[env_id]], None),
-        ([5, None, 6, None, 0], OPTIONS[env_id], None),
-        (None, CHANGED[FAMILY[env_id]], np.array([True, False, False, True, False])),  # some in the wait for a reset
+        ([5, None, 0], OPTIONS[env_id], None),
+        (None, CHANGED[FAMILY[env_id]], np.array([True, False, True])),  # some in the wait for a reset
         (None, None, None),
     ]
     check_resets_and_steps(ours, theirs, resets)
@@ -41,7 +41,7 @@ def test_without_autoreset_the_caller_resets(env_id):
     ours, theirs = both(env_id, DISABLED)
     reset_both(ours, theirs, 3, HASTY[FAMILY[env_id]])
     rng, ended = np.random.default_rng(0), 0
-    for _ in range(150):
+    for _ in range(100):
         actions = mixed_actions(ours, rng)
         result = ours.step(actions)
         check_same(result, theirs.step(actions))
@@ -60,7 +60,7 @@ def test_limit_of_steps_is_gymnasiums(env_id, mode):
     ours, theirs = both(env_id, mode, max_episode_steps=23)
     reset_both(ours, theirs, 0, None)
     rng, limits = np.random.default_rng(0), 0
-    for _ in range(80):
+    for _ in range(60):
         actions = mixed_actions(ours, rng)
         *result, infos = ours.step(actions)
         check_same(result, [*theirs.step(actions)[:4]])

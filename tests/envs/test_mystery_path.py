@@ -364,7 +364,7 @@ def test_debug_render_shows_the_path(env_id):
     env = gym.make(env_id, render_mode="debug_rgb_array").unwrapped
     env.reset(seed=2)
     endless, s = "Endless" in env_id, env.batch.state
-    for _ in range(60):
+    for _ in range(30):
         frame = env.render()
         assert frame.shape == (336, 336, 3)
         assert frame.dtype == np.uint8

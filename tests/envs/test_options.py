@@ -15,14 +15,14 @@ from memory_gym_envs import MortarMayhem, MysteryPath, SearingSpotlights
 def test_options_stay_until_the_next_explicit_reset(env_id):
     envs, hasty = make(env_id), HASTY[FAMILY[env_id]]
     envs.reset(seed=0, options=hasty)
-    steps = roll(envs, 200)
+    steps = roll(envs, 100)
     ends = [reward for step in steps for reward in step[1][step[2] | step[3]]]
     assert len(ends) > LANES  # several episodes a lane
     assert min(ends) == min(ends[LANES:]) == -1.0
     assert envs.settings == [envs.complete_options(hasty)] * LANES
     envs.reset()
     assert envs.settings == [envs.defaults] * LANES
-    assert all((step[1] >= 0).all() for step in roll(envs, 200))
+    assert all((step[1] >= 0).all() for step in roll(envs, 100))
 
 
 @EACH

@@ -35,8 +35,8 @@ def test_no_render_mode_warns(env_id):
 def test_debug_render_circles_the_target(env_id):
     env = gym.make(env_id, render_mode="debug_rgb_array").unwrapped
     observation, info = env.reset(seed=2)
-    for _ in range(20):
-        for _ in range(2):
+    for _ in range(10):
+        for _ in range(4):
             observation, _, over, _, info = env.step(env.action_space.sample())
             if over:
                 observation, info = env.reset()
@@ -95,8 +95,8 @@ def test_debug_render_lights_everything(env_id):
     """Floor, agent, coin and exit show in the dark; green circles are where the agent's view is lit."""
     env = gym.make(env_id, render_mode="debug_rgb_array").unwrapped
     env.reset(seed=2, options={"spot_damage": 0, "light_dim_off_duration": 0})
-    for step in range(25):
-        for _ in range(2):
+    for step in range(12):
+        for _ in range(4):
             observation, _, _, _, info = env.step([0, 0])
         frame = env.render()
         assert frame.shape == (336, 336, 3)

@@ -143,7 +143,7 @@ def test_default_player_mostly_wins():
 
 def test_endless_player_collects_until_time_runs_out():
     env, act = make(ENDLESS)
-    env.reset(seed=5, options={**SAFE, "max_steps": 2000})
+    env.reset(seed=5, options={**SAFE, "max_steps": 800})
     total, places, truncated = 0.0, set(), False
     while not truncated:
         places.add(tuple(env.batch.state.bodies[:, 0, COIN].tolist()))
@@ -151,8 +151,8 @@ def test_endless_player_collects_until_time_runs_out():
         assert not terminated
         assert reward in (0.0, 0.25)
         total += reward
-    assert info["length"] == 2000
-    assert info["coins_collected"] == total / 0.25 >= len(places) - 1 > 40
+    assert info["length"] == 800
+    assert info["coins_collected"] == total / 0.25 >= len(places) - 1 > 15
     assert info["reward"] == total
 
 
@@ -393,7 +393,7 @@ def test_things_keep_their_distance():
 @pytest.mark.parametrize("coins", [4, 20])
 def test_more_coins_than_there_is_room_for(coins):
     env, act = make(FINITE)
-    for seed in range(6):
+    for seed in range(3):
         rewards, _, _, info = play_out(env, act, seed, {**SAFE, "num_coins": [coins], "max_steps": 2000})
         assert info["coins_collected"] == 1.0
         assert sum(rewards) == 0.25 * coins + 1
@@ -475,13 +475,13 @@ def test_coin_feedback_changes_no_rule():
     envs.reset(seed=0, options={**SAFE, "coin_feedback": False})
     twin.reset(seed=0, options=SAFE)
     total = 0.0
-    for _ in range(300):
+    for _ in range(150):
         ours, theirs = envs.step(player(envs)), twin.step(player(twin))
         total += ours[1].sum()
         for left, right in zip(ours[1:4], theirs[1:4], strict=True):
             np.testing.assert_array_equal(left, right)
         np.testing.assert_array_equal(ours[4]["ground_truth"], theirs[4]["ground_truth"])
-    assert total > 10
+    assert total > 5
     assert generators(envs) == generators(twin)
 
 
@@ -507,14 +507,15 @@ def spawns(env, steps):
 def test_spawn_delay(env_id):
     """It is added to each interval, the first one too."""
     env, _ = make(env_id)
-    firsts = set()
+    firsts, every_wait = set(), set()
     for seed in range(12):
         env.reset(seed=seed, options={**every(env_id, 5), "spawn_delay": [0, 3, 7]})
-        waits = spawns(env, 300)
-        assert {*waits} == {5, 8, 12}
-        assert sum(waits) > 300 - 12
+        waits = spawns(env, 100)
+        assert len({*waits}) > 1
+        assert sum(waits) > 100 - 12
         firsts.add(waits[0])
-    assert firsts == {5, 8, 12}
+        every_wait |= {*waits}
+    assert firsts == every_wait == {5, 8, 12}
     env.reset(seed=0, options={**every(env_id, 5), "spawn_delay": [6]})
     assert spawns(env, 115) == [11] * 10
     env.reset(seed=0, options=every(env_id, 5))

@@ -19,9 +19,9 @@ from players import FAMILY, choices
 def test_copies_have_the_same_future(env_id, obs_type, clone, num_levels):
     envs = make(env_id, obs_type=obs_type, num_levels=num_levels)
     envs.reset(seed=1, options=HASTY[FAMILY[env_id]] | {"agent_scale": 0.3})
-    roll(envs, 70)
+    roll(envs, 40)
     twin = clone(envs)
-    check_same(roll(envs, 100, seed=2), roll(twin, 100, seed=2))
+    check_same(roll(envs, 50, seed=2), roll(twin, 50, seed=2))
     for ours, theirs in zip(envs.np_random, twin.np_random, strict=True):
         assert ours is not theirs
         assert ours.bit_generator.state == theirs.bit_generator.state
@@ -48,7 +48,7 @@ def test_returned_arrays_are_the_callers(env_id, obs_type):
     twin.reset(seed=0)
     for _ in range(3):
         spoil(results.pop())
-        for left, right in zip(roll_and_spoil(envs, 60), roll(twin, 60), strict=True):
+        for left, right in zip(roll_and_spoil(envs, 30), roll(twin, 30), strict=True):
             check_same(left, right)
         results.append(envs.reset())
         twin.reset()

@@ -8,7 +8,7 @@ from collections import defaultdict
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import EACH, MORTAR
+from helpers import EACH, MORTAR, check_same
 from players import FAMILY, player, spot_player, stumbling
 
 from memory_gym_envs import IDS, MortarMayhem, MysteryPath, SearingSpotlights
@@ -68,29 +68,31 @@ SAME = 0.8
 
 
 def play(env_id, options, seed):
-    """Frames (with the B ids' commands), their vectors and ground truths, of all lanes and steps, last ones too."""
-    frames, vectors = gym.make_vec(env_id, num_envs=LANES), gym.make_vec(env_id, num_envs=LANES, obs_type="vector")
+    """Hashes of all frames (with the B ids' commands), last ones of episodes too, with their vectors and truths."""
+    envs, twin = gym.make_vec(env_id, num_envs=LANES), gym.make_vec(env_id, num_envs=LANES, obs_type="vector")
+    for each in (envs, twin):
+        each.reset(seed=seed, options=options)
+    twin.state = envs.state  # it plays no levels of its own, which would take as long again
+    space, pixels, seen = twin.single_observation_space, envs.pixels, []
+
+    def observe(lanes):
+        frames, vectors = pixels(lanes), twin.vectors(lanes)
+        assert ((space.low <= vectors) & (vectors <= space.high)).all()
+        seen.extend(zip(unique(frames), vectors, envs.ground_truth()[lanes], strict=True))
+        return frames
+
+    envs.pixels = observe
+    observe(ALL)
     rng, chances = np.random.default_rng(seed), np.linspace(0, 1, LANES)
-    (left, infos), (right, _) = (envs.reset(seed=seed, options=options) for envs in (frames, vectors))
-    yield from zip(unique(left), right, infos["ground_truth"], strict=True)
     for _ in range(STEPS):
-        actions = stumbling(frames, rng, chances)
-        left, rewards, *_, infos = frames.step(actions)
-        right, same, *_, others = vectors.step(actions)
-        assert np.array_equal(rewards, same)
-        assert right in vectors.observation_space
-        yield from zip(unique(left), right, infos["ground_truth"], strict=True)
-        for lane in np.flatnonzero(infos.get("_final_obs", [])).tolist():
-            frame, vector = (each["final_obs"][lane] for each in (infos, others))
-            assert vector in vectors.single_observation_space
-            (frame,) = unique({key: value[None] for key, value in frame.items()} if "B-" in env_id else frame[None])
-            yield frame, vector, infos["final_info"]["ground_truth"][lane]
+        envs.step(stumbling(envs, rng, chances))
+    return seen
 
 
 def unique(observations):
-    """What each lane sees as bytes."""
+    """What each lane sees as a number."""
     parts = observations.values() if isinstance(observations, dict) else [observations]
-    return [b"".join(each.tobytes() for each in lane) for lane in zip(*parts, strict=True)]
+    return [hash(b"".join(each.tobytes() for each in lane)) for lane in zip(*parts, strict=True)]
 
 
 def check(pairs):
@@ -98,7 +100,7 @@ def check(pairs):
     seen, truths, count = {}, defaultdict(set), 0
     for frame, vector, truth in pairs:
         count += 1
-        frame, vector = hash(frame), vector.tobytes()
+        vector = vector.tobytes()
         assert seen.setdefault(frame, vector) == vector
         truths[frame].add(truth.tobytes())
     return count, len(seen), len(set(seen.values())), sum(len(each) > 1 for each in truths.values())
@@ -125,13 +127,18 @@ def combinations(*values):
 
 def look(env_id, options, **state):
     """The frames and vectors of an environment whose lanes are in this state: as check() counts them."""
-    envs = gym.make_vec(env_id, num_envs=len(state["facing"]), obs_type="vector")
-    envs.reset(seed=0, options=options)
-    assert state.keys() <= envs.state.__dataclass_fields__.keys()
+    count = len(state["facing"])
+    one, envs = (gym.make_vec(env_id, num_envs=lanes, obs_type="vector") for lanes in (1, count))
+    one.reset(seed=0, options=options)
+    envs.settings = one.settings * count
+    envs.configure(np.arange(count))
+    assert state.keys() <= vars(one.state).keys()
     # All lanes have the same level, but for what is set.
-    for name in envs.state.__dataclass_fields__:
-        field = getattr(envs.state, name)
-        field[:] = state.get(name, field[0] if len(field) else field)
+    for name, field in vars(one.state).items():
+        setattr(envs.state, name, np.repeat(field, count, axis=0))
+    for name, values in state.items():
+        getattr(envs.state, name)[:] = values
+    envs.place_tables()
     return envs, check(zip(unique(envs.frames(ALL)), envs.vectors(ALL), envs.ground_truth(), strict=True))
 
 
@@ -209,7 +216,7 @@ def test_tiles_behind_large_agents(arena, scale):
 def test_crosses_over_agents(env_id, scale):
     """A cross hides much of a small agent, and the screen's edge hides crosses."""
     endless = env_id.startswith("Endless")
-    rows = np.arange(-PAD, 84 + PAD) if endless else np.arange(25, 50)
+    rows = np.r_[-PAD:26, 60 : 84 + PAD] if endless else np.arange(25, 50)  # edges hide nothing in between
     x, y, facing, shows_cross = combinations([42], rows, np.arange(FACINGS), [False, True])
     state = {"pos": np.stack([x, y], axis=1) + PAD, "facing": facing, "shows_cross": shows_cross}
     envs, (count, frames, vectors, _) = look(env_id, {"agent_scale": scale}, **state)
@@ -268,6 +275,22 @@ def test_space(env_id):
     names = [row.name for row in rows]
     assert len(set(names)) == len(names)
     assert all(row.meaning and row.low < row.high for row in rows)
+
+
+@EACH
+def test_the_same_game_with_pixels(env_id):
+    """The same frames and rewards, to the end of some episodes."""
+    pixels, vectors = (gym.make_vec(env_id, num_envs=4, obs_type=obs_type) for obs_type in ("pixels", "vector"))
+    pixels.reset(seed=1)
+    vectors.reset(seed=1)
+    rng, ended = np.random.default_rng(1), False
+    for _ in range(STEPS):
+        actions = stumbling(pixels, rng, np.linspace(0, 1, 4))
+        (frames, *numbers, infos), (_, *same, _) = pixels.step(actions), vectors.step(actions)
+        check_same(frames, vectors.pixels(ALL))
+        check_same(numbers, same)
+        ended |= "final_obs" in infos
+    assert ended
 
 
 @EACH
