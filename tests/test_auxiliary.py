@@ -92,12 +92,11 @@ def test_the_ground_truth_belongs_to_the_observation(played, script, ends):
 @SCRIPTS
 @PROBES
 def test_a_probe_teaches_nobody_else(played, script, name, part):
-    changes = {"script": script, "env_id": "MortarMayhem-Grid-v0", f"{name}_coef": 10.0}
-    found = {}
+    changes, found = {"script": script, "env_id": "MortarMayhem-Grid-v0", "num_steps": 6}, {}
     for detach in (False, True):
-        args, run, *_ = played(**changes, **{"auxiliary_detach": detach})
+        args, run, *_ = played(**changes, **{f"{name}_coef": 10.0, "auxiliary_detach": detach})
         found[detach] = loss_of(script, args, run)[2]
-    args, run, *_ = played(script=script, env_id="MortarMayhem-Grid-v0")
+    args, run, *_ = played(**changes)
     without = loss_of(script, args, run)[2]
     for name, gradient in without.items():
         assert found[True][name].equal(gradient), name
@@ -106,14 +105,15 @@ def test_a_probe_teaches_nobody_else(played, script, name, part):
 
 
 @SCRIPTS
-@PROBES
-def test_a_run_with_a_probe_is_the_run_without(tiny, curves, script, name, part):
-    """To the last bit, however much the probe's loss weighs: the gradient's clipping does not see it."""
-    args = tiny(script, env_id="MortarMayhem-Grid-v0", exp_name="without")
-    probe = {"auxiliary_detach": True, f"{name}_coef": 100.0}
+def test_a_run_with_probes_is_the_run_without(tiny, curves, script):
+    """To the last bit, however much the probes' losses weigh: the gradient's clipping does not see them."""
+    args = tiny(script, env_id="MortarMayhem-Grid-v0", num_steps=8, total_timesteps=64, exp_name="without")
+    probes = {"auxiliary_detach": True, "ground_truth_coef": 100.0, "reconstruction_coef": 100.0}
     without = curves(script.main(args))
-    probed = curves(script.main(dataclasses.replace(args, exp_name="probed", **probe)))
-    assert probed[f"losses/{name}_loss"][0][1] > 0
+    probed = curves(script.main(dataclasses.replace(args, exp_name="probed", **probes)))
+    assert len(without["losses/loss"]) == 2, "the second one acts with weights that the first has changed"
+    assert probed["losses/ground_truth_loss"][0][1] > 0
+    assert probed["losses/reconstruction_loss"][0][1] > 0
     for curve in set(without) - {"losses/loss"}:
         assert probed[curve] == without[curve], curve
 
@@ -136,7 +136,7 @@ def test_a_head_can_be_added_to_a_trained_agent(tiny, opened):
 
 @SCRIPTS
 def test_both_losses_fall(tiny, scalars, script):
-    changes = {"num_envs": 2, "num_steps": 16, "total_timesteps": 15 * 32, "anneal_steps": 0, "init_lr": 3e-3}
+    changes = {"num_envs": 2, "num_steps": 8, "total_timesteps": 15 * 16, "anneal_steps": 0, "init_lr": 3e-3}
     curves = scalars(script.main(tiny(script, env_id="MortarMayhem-Grid-v0", vf_coef=0.0, **changes, **HEADS)))
     for name in ("reconstruction_loss", "ground_truth_loss"):
         losses = curves[f"losses/{name}"]

@@ -280,5 +280,8 @@ def test_environments_that_cannot_be_split():
     command = [ppo_gru.__file__, *flags_of(ppo_gru, **{"num-envs": 3, "total-timesteps": 480})]
     for done in run_together(programs.command(*command)):
         assert done.returncode == 1
-        assert done.stderr.splitlines() == ["ppo_gru.py: --num-envs is 3; it must be a multiple of the 2 processes"]
+        assert "Traceback" not in done.stderr
+        # PyTorch may warn of who has ended first.
+        own = [line for line in done.stderr.splitlines() if line.startswith("ppo")]
+        assert own == ["ppo_gru.py: --num-envs is 3; it must be a multiple of the 2 processes"]
     assert not Path("runs").exists()

@@ -34,12 +34,13 @@ from ppo_utils.run_logs import read_run
 
 GRID = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector"}
 ENDLESS = {"env_id": "Endless-SearingSpotlights-v0", "obs_type": "vector"}
+PIXELS = {"num_steps": 8, "update_epochs": 1}  # of pictures fewer, since each takes long
 # What has a state of its own is in one of these; together, where neither hides the other.
 RUNS = {
-    "GRU, pixels, veil": {"env_id": "MortarMayhemB-Grid-v0", "spotlight_perturbation": True},
+    "GRU, pixels, veil": {"env_id": "MortarMayhemB-Grid-v0", "spotlight_perturbation": True, **PIXELS},
     "GRU, endless": {**ENDLESS, "seq_len": 5, "num_layers": 2, "refresh_memory": True},
     "LSTM, pixels, reconstruction": {
-        "env_id": "MortarMayhemB-Grid-v0", "memory": "lstm", "reconstruction_coef": 0.1
+        "env_id": "MortarMayhemB-Grid-v0", "memory": "lstm", "reconstruction_coef": 0.1, **PIXELS
     },
     "no memory, stack": {**GRID, "memory": "none", "frame_stack": 3, "step_encoding": True, "norm_adv": "batch"},
     "GRU, probe": {
@@ -66,11 +67,11 @@ RUNS = {
     },
     "GTrXL, Muon, pixels, evaluations": {
         "script": ppo_trxl, "env_id": "MortarMayhem-Grid-v0", "trxl_gate": "gru", "optimizer": "muon",
-        "eval_interval": 1, "eval_levels": 1, "eval_max_steps": 30,
+        "eval_interval": 1, "eval_levels": 1, "eval_max_steps": 20, **PIXELS,
     },
     "TrXL, both heads": {
         "script": ppo_trxl, "env_id": "SearingSpotlights-v0", "ground_truth_coef": 0.1, "reconstruction_coef": 0.1,
-        "auxiliary_detach": True,
+        "auxiliary_detach": True, **PIXELS,
     },
 }  # fmt: skip
 
@@ -126,11 +127,12 @@ def copied_after(monkeypatch, step):
 def test_a_resumed_run_is_the_unstopped_one(tiny, curves, monkeypatch, name):
     changes = dict(RUNS[name])
     script = changes.pop("script", ppo_gru)
-    few = {"total_timesteps": 4 * 64, "checkpoint_interval": 2, "num_levels": 50}
+    batch = 4 * changes.get("num_steps", 16)
+    few = {"total_timesteps": 4 * batch, "checkpoint_interval": 2, "num_levels": 50}
     args = tiny(script, **few, seed=3, **changes)
-    folder = copied_after(monkeypatch, 2 * 64)
+    folder = copied_after(monkeypatch, 2 * batch)
     whole = curves(script.main(args))
-    assert {step for step, _ in curves(folder)["losses/loss"]} == {64, 128}
+    assert {step for step, _ in curves(folder)["losses/loss"]} == {batch, 2 * batch}
     torch.manual_seed(99)
     np.random.seed(99)  # noqa: NPY002
     assert resumed(script, folder) == folder
@@ -163,7 +165,7 @@ def test_a_longer_training_goes_on_where_the_shorter_one_ended(tiny, curves, scr
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_what_was_played_twice_is_logged_once(tiny, curves, monkeypatch, script):
     """A crash after the checkpoint: an iteration and its evaluation are done again."""
-    few = {"eval_interval": 1, "eval_levels": 2}
+    few = {"eval_interval": 1, "eval_levels": 2, "eval_max_steps": 20}
     args = tiny(script, **GRID, total_timesteps=6 * 64, checkpoint_interval=2, **few)
     whole = curves(script.main(args))
     with monkeypatch.context() as patch:
@@ -207,9 +209,9 @@ def test_a_run_that_is_being_trained(tiny, opened):
 
 
 def test_which_files_are_kept(tiny):
-    folder = ppo_gru.main(tiny(**GRID, total_timesteps=10 * 64, checkpoint_interval=3))
-    assert sorted(path.name for path in folder.glob("*.pt")) == ["checkpoint-576.pt", "checkpoint-640.pt"]
-    assert read_model(folder / "checkpoint-576.pt")["step"] == 576
+    folder = ppo_gru.main(tiny(**GRID, total_timesteps=5 * 64, checkpoint_interval=2))
+    assert sorted(path.name for path in folder.glob("*.pt")) == ["checkpoint-256.pt", "checkpoint-320.pt"]
+    assert read_model(folder / "checkpoint-256.pt")["step"] == 256
     folder = ppo_gru.main(tiny(**GRID, checkpoint_interval=0, exp_name="none"))
     assert not list(folder.glob("*.pt"))
 
@@ -406,6 +408,13 @@ def trained_once(tiny, tmp_path_factory):
         return ppo_gru.main(tiny(**GRID, checkpoint_interval=1)).absolute()
 
 
+@pytest.fixture(scope="session")
+def transformer_once(tiny, tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("transformer"))
+        return ppo_trxl.main(tiny(ppo_trxl, **GRID)).absolute()
+
+
 @pytest.fixture
 def trained(trained_once, tmp_path):
     """The folder of a run of two iterations, with the checkpoints of both, for this test alone."""
@@ -465,8 +474,8 @@ def test_a_folder_that_cannot_be_written(trained, monkeypatch):
 
 
 @pytest.mark.parametrize("missing", ["carry", "rates", "hidden states", "return_scale", "optimizers", "optimizer"])
-def test_a_checkpoint_of_another_version(tiny, missing):
-    folder = ppo_trxl.main(tiny(ppo_trxl, **GRID, capture_video=False))
+def test_a_checkpoint_of_another_version(transformer_once, tmp_path, missing):
+    folder = shutil.copytree(transformer_once, tmp_path / "runs" / transformer_once.name)
     path = folder / "checkpoint-128.pt"
     saved = read_model(path)
     if missing == "carry":  # before, its parts were beside the environments

@@ -17,7 +17,7 @@ OPTIONS = {
     "MortarMayhem-Grid-v0": {"command_count": [1, 4], "command_show_delay": [0, 1]},
     "MortarMayhemB-v0": {"agent_scale": 0.4, "agent_speed": 4.5},
     "MortarMayhemB-Grid-v0": {"arena_size": 3, "explosion_duration": [1, 2]},
-    "Endless-MortarMayhem-v0": {"max_steps": 120, "explosion_delay": [12, 18]},
+    "Endless-MortarMayhem-v0": {"max_steps": 120, "explosion_delay": [12, 18], "agent_speed": 3.7},
     "MysteryPath-v0": {"max_steps": 25, "show_origin": True, "show_goal": True, "cardinal_origin_choice": [0, 3]},
     "MysteryPath-Grid-v0": {"max_steps": 20, "reward_path_progress": 0.1, "show_goal": True},
     "Endless-MysteryPath-v0": {"stamina_level": 15, "show_stamina": True, "show_background": True, "agent_speed": 4.6}
@@ -29,7 +29,7 @@ OPTIONS = {
 CHANGED = {
     MortarMayhem: {"explosion_delay": [9], "agent_scale": 0.5},
     MysteryPath: {"reward_step": -0.5, "agent_scale": 0.4},
-    SearingSpotlights: {"spot_min_radius": 4.0, "spot_max_radius": 17, "initial_spawns": 9, "agent_scale": 0.5}
+    SearingSpotlights: {"spot_min_radius": 2.0, "spot_max_radius": 30, "initial_spawns": 9, "agent_scale": 0.5}
     | {"spawn_delay": [0, 3, 8]},
 }
 
