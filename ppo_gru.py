@@ -143,7 +143,8 @@ QUICKSTART = {
     # Two commands, each shown for one step, and six steps to carry one out.
     "env_options": '{"command_count": [2], "command_show_duration": [1], "command_show_delay": [0], '
     '"explosion_delay": [4], "explosion_duration": [2]}',
-    "num_steps": 32, "num_minibatches": 8, "init_lr": 2e-3, "value_init_gain": 0.01, "total_timesteps": 480_000,
+    "hidden_size": 64, "trunk_size": 64, "num_steps": 32, "num_minibatches": 8, "init_lr": 4e-3,
+    "value_init_gain": 0.01, "total_timesteps": 400_000,
 }  # fmt: skip
 PRESETS = {"thesis": {}, "laptop": LAPTOP, "quickstart": QUICKSTART}  # thesis: the defaults above
 

@@ -162,7 +162,7 @@ QUICKSTART = {
     # Two commands, each shown for one step, and six steps to carry one out.
     "env_options": '{"command_count": [2], "command_show_duration": [1], "command_show_delay": [0], '
     '"explosion_delay": [4], "explosion_duration": [2]}',
-    "num_steps": 32, "num_minibatches": 8, "init_lr": 2e-3, "total_timesteps": 480_000,
+    "trunk_size": 64, "num_steps": 32, "num_minibatches": 8, "init_lr": 4e-3, "total_timesteps": 400_000,
 }  # fmt: skip
 PRESETS = {"thesis": {}, "laptop": LAPTOP, "quickstart": QUICKSTART}  # thesis: the defaults above
 

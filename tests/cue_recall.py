@@ -1,7 +1,8 @@
 """CueRecall-v0: the smallest task that cannot be solved without memory.
 
-A cue is shown at the first step only and asked for ten to twelve blank steps later. Observation (3,): the cue one-hot,
-then whether this step asks. Action MultiDiscrete([2, 2]): each branch names a cue, heard only when asked for.
+A cue is shown at the first step only, and asked for after blank steps: at least blanks[0] and fewer than blanks[1].
+Observation (3,): the cue one-hot, then whether this step asks. Action MultiDiscrete([2, 2]): each branch names a cue,
+heard only when asked for.
 Reward, at the end: the share of branches that are right, so 1 at best and 0.5 for guessing.
 """
 
@@ -13,10 +14,13 @@ class CueRecall(gym.Env):
     observation_space = gym.spaces.Box(0.0, 1.0, (3,), np.float32)
     action_space = gym.spaces.MultiDiscrete([2, 2])
 
+    def __init__(self, blanks=(10, 13)):
+        self.range = blanks
+
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.cue = int(self.np_random.integers(2))
-        self.blanks = int(self.np_random.integers(10, 13))
+        self.blanks = int(self.np_random.integers(*self.range))
         self.t = 0
         obs = np.zeros(3, np.float32)
         obs[self.cue] = 1
