@@ -256,6 +256,7 @@ def test_an_environment_that_changes_the_folder(tiny, tmp_path, monkeypatch, cap
 
     class Away(type(gym.make("CueRecall-v0").unwrapped)):
         def __init__(self):
+            super().__init__()
             if when == "made":
                 os.chdir("/")
 
