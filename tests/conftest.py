@@ -11,7 +11,7 @@ import cue_recall  # noqa: F401 (registers CueRecall-v0)
 import numpy as np
 import pytest
 import torch
-import torch._dynamo  # the first optimizer does, and would in each forked program anew
+import torch._dynamo  # the first optimizer needs it: here once, and not again in each forked program
 from gymnasium.utils import seeding
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.summary.writer import event_file_writer

@@ -15,12 +15,12 @@ class CueRecall(gym.Env):
     action_space = gym.spaces.MultiDiscrete([2, 2])
 
     def __init__(self, blanks=(10, 13)):
-        self.range = blanks
+        self.limits = blanks
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.cue = int(self.np_random.integers(2))
-        self.blanks = int(self.np_random.integers(*self.range))
+        self.blanks = int(self.np_random.integers(*self.limits))
         self.t = 0
         obs = np.zeros(3, np.float32)
         obs[self.cue] = 1

@@ -109,21 +109,18 @@ def module(name, *flags):
     return run
 
 
-def elsewhere(function, *folders, anew=()):
-    """Return a function that does the same where this repository is not: its modules are those in the folders.
+def is_here(path):
+    """Whether a path is in this repository."""
+    return Path(path).resolve().is_relative_to(ROOT)
 
-    Imported again are the repository's modules, and those of the packages named in `anew`.
-    """
+
+def elsewhere(function, *folders):
+    """Return a function that does the same where this repository is not: its modules are those in the folders."""
 
     def run():
-        sys.path[:] = [
-            *map(str, folders),
-            *(path for path in sys.path if not Path(path).resolve().is_relative_to(ROOT)),
-        ]
-        for name, each in list(sys.modules.items()):
-            file = getattr(each, "__file__", None)
-            if name.partition(".")[0] in anew or (file and Path(file).resolve().is_relative_to(ROOT)):
-                del sys.modules[name]
+        sys.path[:] = [*map(str, folders), *(path for path in sys.path if not is_here(path))]
+        for name in [name for name, each in sys.modules.items() if is_here(getattr(each, "__file__", None) or "/")]:
+            del sys.modules[name]
         function()
 
     return run

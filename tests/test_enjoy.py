@@ -538,6 +538,11 @@ def watch(browser, saved, tmp_path_factory):
     assert browser.execute_script("return performance.getEntriesByType('resource').length") == 0
 
 
+def wait_until(browser, holds, seconds=10):
+    """Wait until something holds, a function of the browser; look more often than Selenium does by itself."""
+    WebDriverWait(browser, seconds, poll_frequency=0.05).until(holds)
+
+
 def step_of(browser):
     return int(browser.find_element("tag name", "output").text.split()[1].strip(","))
 
@@ -553,7 +558,7 @@ def check_shown(browser, videos, step):
         urls = browser.execute_script("return [...document.querySelectorAll('canvas')].map(each => each.toDataURL())")
         return all(np.array_equal(picture(url), video[step]) for url, video in zip(urls, videos, strict=True))
 
-    WebDriverWait(browser, 10, poll_frequency=0.05).until(is_shown)
+    wait_until(browser, is_shown)
 
 
 def place(browser, selector, index):
@@ -704,7 +709,7 @@ def test_keys(browser, watch):
     press(browser, Keys.SPACE)  # plays, from the beginning as it is at the end
     button = browser.find_element("id", "play")
     assert button.text == "Pause"
-    WebDriverWait(browser, 10, poll_frequency=0.05).until(lambda _: 3 <= step_of(browser) < page["steps"] - 1)
+    wait_until(browser, lambda _: 3 <= step_of(browser) < page["steps"] - 1)
     press(browser, Keys.SPACE)
     assert button.text == "Play"
     check_step(browser, videos, step_of(browser))
@@ -716,7 +721,7 @@ def test_keys(browser, watch):
     press(browser, Keys.END, *[Keys.ARROW_LEFT] * 6)  # of the video, not of the list
     check_step(browser, videos, page["steps"] - 7)
     press(browser, Keys.SPACE)
-    WebDriverWait(browser, 60, poll_frequency=0.05).until(lambda _: button.text == "Play")  # stops at the end
+    wait_until(browser, lambda _: button.text == "Play", 60)  # stops at the end
     check_step(browser, videos, page["steps"] - 1)
 
 
@@ -753,9 +758,9 @@ def test_every_width(width, browser, watch):
         for _ in range(2):
             watch(3)
             browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-            WebDriverWait(browser, 10, poll_frequency=0.05).until(lambda _: not browser.execute_script(wide))
+            wait_until(browser, lambda _: not browser.execute_script(wide))
         browser.execute_script(f"document.body.style.width = '{width - 50}px'")
-        WebDriverWait(browser, 10, poll_frequency=0.05).until(lambda _: not browser.execute_script(wide))
+        wait_until(browser, lambda _: not browser.execute_script(wide))
         browser.execute_script("document.body.style.width = ''")
         left, plots = (place(browser, card, 0) for card in ("#left", "#plots"))
         if width > 900:
@@ -777,7 +782,7 @@ def test_dark_mode(browser, watch):
     dark_mode = {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", dark_mode)
     try:
-        WebDriverWait(browser, 10, poll_frequency=0.05).until(lambda _: browser.execute_script(script)[-1] != light[-1])
+        wait_until(browser, lambda _: browser.execute_script(script)[-1] != light[-1])
         dark = browser.execute_script(script)
     finally:
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})

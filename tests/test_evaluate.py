@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import subprocess
 import sys
 import xml.etree.ElementTree
 from dataclasses import asdict
@@ -14,7 +15,6 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 from PIL import Image
-from programs import Program, command, elsewhere
 from torch.utils.tensorboard import SummaryWriter
 
 import enjoy
@@ -864,13 +864,9 @@ def test_drawing_alone_needs_the_extra(agents, monkeypatch, capsys):
 
 def test_the_command_prints_one_line_and_fails():
     """Here without what only drawing needs."""
-
-    def hide_and_run():
-        sys.modules |= dict.fromkeys(hidden)
-        command(evaluate.__file__, "nowhere.pt")()
-
-    hidden, root = ("matplotlib", "scipy", "PIL", "plotly"), Path(evaluate.__file__).parent
-    with Program(elsewhere(hide_and_run, root, anew=("gymnasium", "tensorboard", *hidden))) as program:
-        done = program.wait()
+    hide = "import runpy, sys; sys.modules |= dict.fromkeys(['matplotlib', 'scipy', 'PIL', 'plotly'])"
+    code = f"{hide}; runpy.run_path({evaluate.__file__!r}, run_name='__main__')"
+    line = [sys.executable, "-c", code, "nowhere.pt"]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=300)
     assert done.returncode == 1
     assert done.stderr == "evaluate.py: there is no file nowhere.pt; --save-model writes model.pt to the run folder\n"

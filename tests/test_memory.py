@@ -34,7 +34,7 @@ TRANSFORMER = [
 for script in OTHERS:  # a copy of either script, with another memory
     (TRANSFORMER if hasattr(script.Args, "trxl_segment_length") else RECURRENT).append({"script": script})
 WITH_MEMORY = [*RECURRENT, *TRANSFORMER]
-# One for each way to compute: where what is tested is beside the memory, as an encoder is, and the end of an episode.
+# One of each kind: for tests of what lies outside of the memory, as the encoder and the end of an episode do.
 FEW = [RECURRENT[1], RECURRENT[2], RECURRENT[4], TRANSFORMER[1], *({"script": script} for script in OTHERS)]
 MEMORIES = [*WITH_MEMORY, {"memory": "none"}]
 
@@ -70,7 +70,7 @@ def test_presets_and_network_flags_are_flags(script):
     ("env_id", "obs_type", "memory"),
     [
         *(("CueRecall-v0", "pixels", memory) for memory in MEMORIES),  # episodes end inside a rollout
-        *(("Endless-MortarMayhem-v0", "vector", memory) for memory in MEMORIES),  # one is longer than a window of 40
+        *(("Endless-MortarMayhem-v0", "vector", memory) for memory in MEMORIES),  # longer than a window of 40
         *(("MortarMayhemB-Grid-v0", "pixels", memory) for memory in FEW),
     ],
     ids=lambda value: name_of(value) if isinstance(value, dict) else value,

@@ -6,7 +6,10 @@ import os
 import random
 import re
 import signal
+import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +18,6 @@ import pytest
 import torch
 from conftest import collect, parse_args
 from programs import run_together
-from torch.distributed.elastic.multiprocessing.subprocess_handler import subprocess_handler
 
 import ppo_gru
 import ppo_trxl
@@ -55,35 +57,8 @@ close(run)
 """
 
 
-class Worker(programs.Program):
-    """What torchrun starts, forked off it instead: `python -u script flags`, in a session of its own."""
-
-    def __init__(self, args, env, start_new_session, **_):
-        assert args[:2] == (sys.executable, "-u")
-
-        def run():
-            if start_new_session:
-                os.setsid()
-            programs.command(*args[2:])()
-
-        super().__init__(run, **env)
-
-    def poll(self):
-        return None if self.is_running() else self.code
-
-    def wait(self, timeout=None):
-        super().wait(timeout or 300)
-        print(self.said(), file=sys.stderr)
-
-
-def torchrun(*flags):
-    """Return a function that does what torchrun does, with two processes that need not import all again."""
-
-    def run():
-        subprocess_handler.Popen = Worker
-        programs.module("torch.distributed.run", "--standalone", "--nproc-per-node=2", *flags)()
-
-    return run
+def torchrun(*command):
+    return [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", *command]
 
 
 def train_together(path, *flags):
@@ -256,20 +231,24 @@ def test_a_process_that_dies_ends_the_others():
 
 def workers(process):
     """Return the ids of torchrun's processes."""
-    return [*map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split())]
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return [int(child) for child in children if "ppo_gru" in Path(f"/proc/{child}/cmdline").read_text()]
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the processes in /proc")
 def test_a_signal_to_torchrun(curves):
     """As a cluster sends it: to torchrun, which passes it on, and perhaps to all processes too."""
-    with programs.Program(torchrun(*ENDLESS)) as process:
-        process.wait_until(has_checkpoint)
-        pids = workers(process)
-        assert len(pids) == 2
-        for each in [*pids, process.pid]:
-            os.kill(each, signal.SIGTERM)
-        said = process.wait().stderr
-    assert process.code == 1, "torchrun's own"
+    process = subprocess.Popen(torchrun(*ENDLESS), stderr=subprocess.PIPE, text=True, start_new_session=True)
+    deadline = threading.Timer(300, process.kill)
+    deadline.start()
+    while not has_checkpoint():
+        assert process.poll() is None
+        time.sleep(0.1)
+    for each in [*workers(process), process.pid]:
+        os.kill(each, signal.SIGTERM)
+    said = process.communicate()[1]
+    deadline.cancel()
+    assert process.returncode == 1, "torchrun's own"
     assert "another process of this run has ended" not in said
     assert "stopping at the end of this iteration" in said
     (folder,) = Path("runs").iterdir()

@@ -1,4 +1,4 @@
-"""What the pages say of the results in the repository: the commands beside it print it."""
+"""What the pages say of the results in the repository is what the commands beside it print."""
 
 import functools
 import os

@@ -1,12 +1,12 @@
 """A short training of each kind, through `main` and through the command line."""
 
-import contextlib
 import dataclasses
 import glob
 import math
 import os
 import random
 import re
+import subprocess
 import sys
 import traceback
 import types
@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import SCRIPTS, parse_args
-from programs import Program, command, elsewhere, run_command
+from programs import run_command
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import ppo_gru
@@ -513,23 +513,23 @@ def test_a_preset_is_good_for_environments_without_vectors(scalars, script):
     assert len(scalars(script.main(args))["losses/loss"]) == 1
 
 
-EXTRAS = ("imageio_ffmpeg", "wandb", "pygame", "matplotlib", "scipy", "PIL", "plotly", "pytest")
+WITHOUT_EXTRAS = """
+import contextlib, runpy, sys
+sys.modules |= dict.fromkeys(["imageio_ffmpeg", "wandb", "pygame", "matplotlib", "scipy", "PIL", "plotly", "pytest"])
+for script in {scripts}:
+    with contextlib.suppress(SystemExit):
+        runpy.run_path(script, run_name="__main__")
+"""
 
 
 def test_scripts_need_no_extra(tmp_path):
-    """Where what stands on Gymnasium and TensorBoard is imported again, and none of what an extra brings can be."""
-
-    def run_both():
-        sys.modules |= dict.fromkeys(EXTRAS)
-        for script in SCRIPTS:
-            with contextlib.suppress(SystemExit):
-                command(script.__file__, *flags)()
-
+    """In an interpreter of its own, where nothing is imported yet, and none of what an extra brings can be."""
     flags = "--env-id MortarMayhem-Grid-v0 --obs-type vector --total-timesteps 128 --num-envs 2 --num-steps 64"
     flags = [*flags.split(), "--num-minibatches", "2", "--trunk-size", "16", "--no-cuda", "--save-model"]
-    anew = ("gymnasium", "tensorboard", "tyro", "tqdm", *EXTRAS)
-    with Program(elsewhere(run_both, os.path.dirname(ppo_gru.__file__), anew=anew), tmp_path) as program:
-        done = program.wait()
+    code = WITHOUT_EXTRAS.format(scripts=[script.__file__ for script in SCRIPTS])
+    environ = {**os.environ, "PYTHONPATH": os.path.dirname(ppo_gru.__file__)}
+    line = [sys.executable, "-c", code, *flags]
+    done = subprocess.run(line, cwd=tmp_path, env=environ, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert len(re.findall(r"return=-?\d.*length=\d.*SPS=\d", done.stderr)) >= len(SCRIPTS), "the progress bars"
     for script in SCRIPTS:

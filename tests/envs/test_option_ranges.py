@@ -18,7 +18,7 @@ from players import FAMILY, stumbling
 from memory_gym_envs.options import LONGEST_LIST, brief
 
 TIMES = int(os.environ.get("MORE_EXAMPLES", 1))
-LANES, STEPS = 5, 80
+LANES, STEPS = 5, 120
 SECOND = np.array([False, False, False, True, True])  # the lanes that have other options than the rest
 
 
