@@ -136,6 +136,18 @@ def test_plays_on_with_each_wrapper(env_id, obs_type, wrapper):
     check_resumes(envs, lambda: make_envs(env_id, LANES, **arguments), (1, 70))
 
 
+def test_lanes_that_are_not_reset_observe_what_they_did():
+    """Right after loading: what a wrapper shows of the last step is kept too."""
+    envs, again = (make_envs("MortarMayhem-Grid-v0", LANES, seed=1, obs_type="vector", **EVERYTHING) for _ in range(2))
+    envs.reset()
+    shown = [result[0] for _, result in play(envs, 9)][-1]
+    load_state(again, through_a_file(save_state(envs)))
+    mask = np.arange(LANES) == 0
+    observed, _ = again.reset(options={"reset_mask": mask})
+    for name, part in shown.items():
+        assert np.array_equal(observed[name][~mask], part[~mask])
+
+
 @ONE_OBS
 def test_plays_on_with_options_that_differ_between_lanes(env_id, obs_type):
     envs = make_envs(env_id, LANES, obs_type=obs_type, step_encoding=True)
