@@ -110,8 +110,9 @@ def module(name, *flags):
 
 
 def is_here(path):
-    """Whether a path is in this repository."""
-    return Path(path).resolve().is_relative_to(ROOT)
+    """Whether a path is of this repository; a virtual environment in its folder is not."""
+    path = Path(path).resolve()
+    return path.is_relative_to(ROOT) and not path.is_relative_to(Path(sys.prefix).resolve())
 
 
 def elsewhere(function, *folders):
