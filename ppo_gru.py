@@ -6,17 +6,15 @@ The agent gets one observation at a time and carries a hidden state from step to
 The rollout stores the hidden state before each step. For the update, the steps of each environment are cut into
 sequences at the ends of episodes (and every --seq-len steps), padded with zeros to the longest sequence, and run from
 the stored hidden state of their first step: truncated back-propagation through time. The gradient flows back to the
-first step of a sequence and no further. The hidden state that a rollout begins with was computed with older weights.
-From the first gradient step on, the stored states at the cuts of --seq-len are stale as well; --refresh-memory
-recomputes them with the current weights before each epoch but the first.
+first step of a sequence and no further. The stored states at the cuts of --seq-len are stale from the first gradient
+step on; --refresh-memory recomputes them with the current weights before each epoch but the first.
 
 Source: Marco Pleines, "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", dissertation,
 called the thesis below: §5.2 is a section of it, (5.7) an equation. Defaults are the "Final" column of its table 6.1,
 without auxiliary losses.
 
-How to read: section 2 is the training loop and what it calls, from the top down; 3 to 5 are what these are built from,
-4 the memory; 6 makes everything. Code that does not depend on the algorithm comes from ppo_utils/: flags of the run,
-environments, evaluation, run folder, checkpoints, several processes, and faster ways to compute the same.
+How to read: section 2 is the training loop, from the top down; 3 to 5 are what it is built from, 4 the memory; 6 makes
+everything. In ppo_utils/ is what does not depend on the algorithm, and faster ways to compute the same.
 
 Shape letters: T steps of a rollout, N environments, A action branches, B steps of a minibatch, S sequences in it, L
 steps of its longest sequence, I inputs and D width of the memory, P hidden vectors of an environment, F features of the
@@ -132,7 +130,7 @@ class Args(RunArgs):
 
 
 LAPTOP = {
-    "preset": "laptop", "obs_type": "vector", "hidden_size": 128, "trunk_size": 128,
+    "preset": "laptop", "obs_type": "vector", "attend_commands": True, "hidden_size": 128, "trunk_size": 128,
     "num_envs": 128, "num_steps": 128, "num_minibatches": 16, "update_epochs": 2,
     "norm_reward": True, "gamma": 0.99, "clip_coef": 0.2, "target_kl": 0.05, "max_grad_norm": 0.5,
     "exploration_bonus": "log-barrier", "init_ent_coef": 2e-3, "final_ent_coef": 2e-4,
@@ -226,10 +224,9 @@ class Rollout:
     @classmethod
     def allocate(cls, num_steps: int, carry: Carry, agent: Agent) -> Rollout:
         """Make a rollout of zeros on the agent's device."""
-        device = next(agent.parameters()).device
-        obs = as_tensors(carry.obs, device)
-        num_envs, branches = len(next(iter(obs.values()))), len(agent.heads.nvec)
-        zeros = partial(torch.zeros, num_steps, num_envs, device=device)
+        obs, branches = as_tensors(carry.obs, next(agent.parameters()).device), len(agent.heads.nvec)
+        first = next(iter(obs.values()))
+        zeros = partial(torch.zeros, num_steps, len(first), device=first.device)
         return cls(
             obs={name: zeros(*part.shape[1:], dtype=part.dtype) for name, part in obs.items()},
             ground_truth=None if carry.ground_truth is None else zeros(carry.ground_truth.shape[1]),
@@ -251,8 +248,7 @@ def collect(
 ) -> tuple[Rollout, Carry, dict[str, list[float]]]:
     """Act for T steps in all environments; return the steps, what the next rollout begins with, and metrics.
 
-    An ended episode is reset in the same step, so that the next observation begins another one. Metrics of the
-    episodes that ended: see `add_ended`.
+    An ended episode is reset in the same step: the next observation begins another one. Metrics: see `add_ended`.
     """
     device = next(agent.parameters()).device
     obs, ground_truth, episodes = carry.obs, carry.ground_truth, defaultdict(list)
@@ -320,8 +316,9 @@ def ppo_loss(
     autocast = torch.autocast(index.device.type, torch.bfloat16, enabled=args.amp)
     with autocast:
         x = encode(agent.encoder, rollout.obs, index, rollout.first_occurrence)  # (B, I)
+        lists = {name: gather(rollout.obs[name]) for name in agent.heads.scores}  # each (B, rows, columns)
         actions = gather(rollout.actions)  # (B, A)
-        policy, log_probs, values, features = agent.evaluate_actions(x, actions, minibatch, rollout.memory)
+        policy, log_probs, values, features = agent.evaluate_actions(x, lists, actions, minibatch, rollout.memory)
     log_ratio = log_probs - gather(rollout.log_probs)  # (B, A)
     advantages, old_values, returns = gather(rollout.advantages), gather(rollout.values), gather(rollout.returns)
     if args.norm_adv == "minibatch":
@@ -664,17 +661,23 @@ class Encoder(nn.Module):
 class Heads(nn.Module):
     """The layer after the memory, the multi-discrete policy and the state value (table 6.2)."""
 
-    def __init__(self, width: int, nvec: list[int], size: int, value_gain: float):
+    def __init__(self, width: int, lists: dict[str, tuple[int, int]], nvec: list[int], size: int, value_gain: float):
         super().__init__()
         self.nvec = nvec  # number of actions of each branch, as Gymnasium calls it
-        self.trunk = layer_init(nn.Linear(width, size))
+        # Rows of an observed list, (rows, columns), are read by attention, whose keys are their positions alone.
+        self.scores = nn.ModuleDict({name: mlp_head(width, rows, 1.0) for name, (rows, _) in lists.items()})
+        self.trunk = layer_init(nn.Linear(width + sum(columns for _, columns in lists.values()), size))
         self.policy = mlp_head(size, sum(nvec), 0.1)
         self.value = mlp_head(size, 1, value_gain)
 
-    def forward(self, x: Tensor) -> tuple[list[Categorical], Tensor, Tensor]:
-        """Map the memory's output (B, D) to each branch's distribution, values (B,) and features (B, F)."""
+    def forward(self, x: Tensor, obs: dict[str, Tensor]) -> tuple[list[Categorical], Tensor, Tensor]:
+        """Map the memory's output (B, D) and observed lists to each branch's policy, values (B,), features (B, F)."""
         with torch.autocast(x.device.type, enabled=False):  # --amp: bfloat16 is too coarse for values and log-ratios
-            features = F.relu(self.trunk(x.float()))
+            x = x.float()
+            # Scores are normalized: no weight vanishes, and with it the gradient that would find its row later.
+            weights = {name: F.layer_norm(score(x), [score[-1].out_features]) for name, score in self.scores.items()}
+            read = [(weight.softmax(-1)[:, None] @ obs[name])[:, 0] for name, weight in weights.items()]
+            features = F.relu(self.trunk(torch.cat([x, *read], -1)))
             logits = self.policy(features).split(self.nvec, -1)  # A parts
             policy = [Categorical(logits=part, validate_args=False) for part in logits]
             return policy, self.value(features)[:, 0], features
@@ -682,9 +685,8 @@ class Heads(nn.Module):
 
 def mlp_head(size: int, outputs: int, gain: float) -> nn.Sequential:
     """Make a head of two layers; gain initializes the last one."""
-    return nn.Sequential(
-        layer_init(nn.Linear(size, size)), nn.ReLU(inplace=True), layer_init(nn.Linear(size, outputs), gain)
-    )
+    hidden, last = layer_init(nn.Linear(size, size)), layer_init(nn.Linear(size, outputs), gain)
+    return nn.Sequential(hidden, nn.ReLU(inplace=True), last)
 
 
 class Decoder(nn.Sequential):
@@ -725,7 +727,8 @@ class Agent(nn.Module):
         super().__init__()
         self.encoder = Encoder(space.spaces, Memory.input_width(args) if args.embedding else None)
         self.memory = Memory(args, self.encoder.width)
-        self.heads = Heads(self.memory.width, nvec, args.trunk_size, args.value_init_gain)
+        lists = {name: each.shape for name, each in space.items() if len(each.shape) == 2}
+        self.heads = Heads(self.memory.width, lists, nvec, args.trunk_size, args.value_init_gain)
         images = [space[name].shape for name in self.encoder.images]
         if args.reconstruction_coef and len(images) != 1:
             raise ValueError(f"--reconstruction-coef needs an observation with one image, not {len(images)}; use 0")
@@ -736,31 +739,30 @@ class Agent(nn.Module):
     def get_action_and_value(
         self, obs: dict[str, Tensor], state: MemoryState, deterministic: bool = False
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Act in all environments, and move the memory's state on to the next step.
+        """Act in all environments, and move the memory on: actions (N, A), log-probabilities (N, A), values (N,).
 
-        deterministic: take each branch's most probable action instead of sampling. Returns actions (N, A), their
-        log-probabilities (N, A) and values (N,).
+        deterministic: take each branch's most probable action instead of sampling.
         """
         x, hidden = self.memory.step(state, self.encoder(obs))
         self.memory.advance(state, hidden)
-        policy, values, _ = self.heads(x)
+        policy, values, _ = self.heads(x, obs)
         actions = torch.stack([branch.mode if deterministic else branch.sample() for branch in policy], -1)
         return actions, log_probs_of(policy, actions), values
 
     def get_value(self, obs: dict[str, Tensor], state: MemoryState) -> Tensor:
         """Return the values (N,) of observations that are not acted on; the memory's state stays as it is."""
         x, _ = self.memory.step(state, self.encoder(obs))
-        return self.heads(x)[1]
+        return self.heads(x, obs)[1]
 
     def evaluate_actions(
-        self, x: Tensor, actions: Tensor, pieces: Pieces, state: MemoryState
+        self, x: Tensor, lists: dict[str, Tensor], actions: Tensor, pieces: Pieces, state: MemoryState
     ) -> tuple[list[Categorical], Tensor, Tensor, Tensor]:
         """Recompute, with gradient, what `get_action_and_value` computed at the steps of the pieces.
 
-        x: the steps' encoded observations (B, I). Returns the policy, a distribution of B actions for each branch, the
-        log-probabilities (B, A) of the actions (B, A), values (B,) and features (B, F).
+        x: the steps' encoded observations (B, I). lists: in them. Returns the policy, a distribution of B actions for
+        each branch, the log-probabilities (B, A) of the actions (B, A), values (B,) and features (B, F).
         """
-        policy, values, features = self.heads(self.memory.unroll(state, x, pieces))
+        policy, values, features = self.heads(self.memory.unroll(state, x, pieces), lists)
         return policy, log_probs_of(policy, actions), values, features
 
 
@@ -771,12 +773,11 @@ def make_optimizers(agent: Agent, args: Args) -> list[torch.optim.Optimizer]:
     observation or an output, are AdamW's, as is all that is no weight of an `nn.Linear`, such as recurrent layers.
     `train` sets the learning rates; Muon's is three times AdamW's.
     """
-    hidden = []
+    heads, hidden = agent.heads, []
     if args.optimizer == "muon":
-        encoder, heads = agent.encoder, agent.heads
-        inner = [encoder.embedding, agent.memory, heads.trunk, heads.policy[0], heads.value[0]]
-        layers = [layer for part in inner if part is not None for layer in part.modules()]
-        hidden = [layer.weight for layer in layers if isinstance(layer, nn.Linear)]
+        first_layers = [head[0] for head in (heads.policy, heads.value, *heads.scores.values())]
+        inner = filter(None, [agent.encoder.embedding, agent.memory, heads.trunk, *first_layers])
+        hidden = [layer.weight for part in inner for layer in part.modules() if isinstance(layer, nn.Linear)]
     others = [weight for weight in agent.parameters() if weight not in {*hidden}]
     adamw = torch.optim.AdamW([{"params": others, "lr": args.init_lr, "lr_ratio": 1.0}], fused=True)
     if not hidden:

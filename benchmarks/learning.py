@@ -55,8 +55,8 @@ from ppo_utils.scores import own_metric
 from suites import AGENTS, SUITES, TASKS, Task, short
 
 ROOT = Path(__file__).parent.parent
-# The results were trained when 1 was the default of --value-init-gain. An agent's own flags override these.
-COMMON = "--preset laptop --save-model --value-init-gain 1"
+# Most results are older than the last changes of the preset. An agent's own flags override these.
+COMMON = "--preset laptop --save-model --value-init-gain 1 --no-attend-commands"
 FIRST_TEST_LEVEL = 1_000_000
 # Scalars that tell how an iteration's update went.
 UPDATE_CURVES = ("losses/grad_norm", "losses/entropy", "charts/gradient_steps", "charts/learning_rate")

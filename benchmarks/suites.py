@@ -20,7 +20,7 @@ MEMORIES = {
 }
 # The thesis' exploration bonus, with the weights that suit it on these tasks; the preset has the log barrier.
 ENTROPY = "--exploration-bonus entropy --init-ent-coef 1e-3 --final-ent-coef 1e-4"
-MUON = {  # --preset laptop, with --value-init-gain 1 as all agents (learning.COMMON)
+MUON = {  # --preset laptop, with what all agents have (learning.COMMON)
     "no memory, Muon": "ppo_gru.py --memory none",
     "stack of 16, Muon": "ppo_gru.py --memory none --frame-stack 16",
     "GRU, Muon": "ppo_gru.py",
@@ -37,6 +37,9 @@ AGENTS = {
     **MEMORIES,
     "TrXL, preset": ADAMW_TRXL,
     **MUON,
+    # --preset laptop as it is.
+    "GRU, laptop": "ppo_gru.py --attend-commands",
+    "TrXL, laptop": "ppo_trxl.py --attend-commands --value-init-gain 0.01",
     **{f"{name}, low rate": f"{flags} {LOW_RATE}" for name, flags in MUON.items()},
     **{f"{name}, entropy": f"{flags} {ENTROPY}" for name, flags in MEMORIES.items()},
     **{f"{name}, refreshed": f"{flags} --refresh-memory" for name, flags in MEMORIES.items()},

@@ -110,6 +110,8 @@ class RunArgs:
     """what a Memory Gym environment shows: images in color or in gray, or vectors of what can be seen on them"""
     frame_stack: NonNegativeInt = 0
     """observe the last K images, in grayscale, or the last K vectors (0: the current one, in color)"""
+    attend_commands: bool = False
+    """of the commands that Mortar Mayhem's act tasks show all at once, read one at a time, by attention"""
     step_encoding: bool = False
     """also observe a sinusoidal encoding of the episode's step"""
     observe_last_action: bool = False

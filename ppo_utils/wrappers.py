@@ -1,4 +1,4 @@
-"""Vector wrappers of observations: frame stacks, the step, the last action, Fourier features, a perturbation.
+"""Vector wrappers of observations: frame stacks, lists, the step, the last action, Fourier features, a perturbation.
 
 They take any vector environment with same-step autoreset. Gymnasium's (1.4) own vector wrappers of observations refuse
 those, and it has no frame stack for vector environments at all.
@@ -18,6 +18,8 @@ from gymnasium.vector.utils import batch_space
 from memory_gym_envs.base import ALL, checked_integer, lane_seeds, one_of, overwrite
 from memory_gym_envs.bits import pixels
 from memory_gym_envs.drawing import FRAME, SCREEN, gray
+from memory_gym_envs.mortar_mayhem import VARIANTS as MORTAR_MAYHEM
+from memory_gym_envs.mortar_mayhem.options import VECTOR_COMMANDS
 from memory_gym_envs.options import brief, complete_options
 from memory_gym_envs.saving import Saved
 from memory_gym_envs.searing_spotlights import VARIANTS, SearingSpotlights
@@ -26,7 +28,7 @@ from memory_gym_envs.searing_spotlights.rules import spot_places
 from memory_gym_envs.searing_spotlights.state import SPEED, TIME
 
 OBSERVATION = "observation"  # the name of an observation that is no Dict, where it becomes a part of one
-STEP_ENCODING, LAST_ACTION = "step_encoding", "last_action"  # parts of a Dict that the wrappers add
+COMMANDS, STEP_ENCODING, LAST_ACTION = "commands", "step_encoding", "last_action"  # parts that the wrappers add
 SINES, COSINES = "sines", "cosines"
 MOST_ENTRIES = 2**24  # of a one-hot vector: the weights of a layer of 128 that takes it are 8 GB
 SPOT_STREAM = 2  # keeps the generators of the perturbation apart from those of the environment with the same seed
@@ -178,15 +180,44 @@ class GrayscaleStack(ImageWrapper):
         return self.replaced(observations, self._stack[lanes].copy())
 
 
+class CommandList(SameStepWrapper):
+    """The commands of Mortar Mayhem's act tasks as a list, apart from other entries of the vector that they are in.
+
+    Observation: Dict of `commands`, Box (20, 9) float32, and all else, that vector without them.
+
+    Raises ValueError for an environment without same-step autoreset or without such a vector.
+    """
+
+    def __init__(self, env: VectorEnv):
+        super().__init__(env)
+        parts = {**named(env.single_observation_space)}
+        self._part = next((name for name in (OBSERVATION, "vector_observation") if name in parts), None)
+        if not is_act_task(env) or self._part is None:
+            raise ValueError(f"CommandList needs what an act task of Mortar Mayhem observes, not {env}")
+        vector, commands = parts.pop(self._part), gym.spaces.Box(0.0, 1.0, (VECTOR_COMMANDS, 9), np.float32)
+        self._others = vector.shape[0] - math.prod(commands.shape)  # number of entries before the commands
+        if self._others:
+            low, high = vector.low[: self._others], vector.high[: self._others]
+            parts[self._part] = gym.spaces.Box(low, high, dtype=vector.dtype)
+        self._set_space(gym.spaces.Dict({**parts, COMMANDS: commands}))
+
+    def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
+        """Return the lanes' observations, their commands apart."""
+        parts = {**named(observations)}
+        vectors = parts.pop(self._part)
+        if self._others:
+            parts[self._part] = vectors[:, : self._others].copy()
+        return {**parts, COMMANDS: vectors[:, self._others :].reshape(-1, VECTOR_COMMANDS, 9).copy()}
+
+
 class VectorStack(SameStepWrapper):
     """The last K vectors instead of the last one, for vector observations as `GrayscaleStack` for images.
 
-    frames: K. Of a Dict of vectors, each is stacked by itself.
+    frames: K. Of a Dict, each vector is stacked by itself; other parts stay as they are.
     Observation: Box (K * V,), the newest vector last, or a Dict of such. An episode begins with its first vector K
     times.
 
-    Raises ValueError for an environment without same-step autoreset or other than vectors (V,) as observation, and for
-    K below 1.
+    Raises ValueError for an environment without same-step autoreset or without a vector (V,), and for K below 1.
     """
 
     kept = ("_stacks",)
@@ -195,33 +226,32 @@ class VectorStack(SameStepWrapper):
         super().__init__(env)
         space, frames = env.single_observation_space, checked_integer("frames", frames, 1)
         self.arguments = {"frames": frames}
-        parts = named(space)
-        if not all(isinstance(part, gym.spaces.Box) and len(part.shape) == 1 for part in parts.values()):
-            raise ValueError(f"VectorStack needs a vector to observe, or a Dict of vectors, not {space}")
-        self._stacks = {k: np.zeros((self.num_envs, frames, *part.shape), part.dtype) for k, part in parts.items()}
-        stacked = {}
-        for name, part in parts.items():
+        parts = {**named(space)}
+        vectors = {k: part for k, part in parts.items() if isinstance(part, gym.spaces.Box) and len(part.shape) == 1}
+        if not vectors:
+            raise ValueError(f"VectorStack needs a vector to observe, or a Dict with one, not {space}")
+        self._stacks = {k: np.zeros((self.num_envs, frames, *part.shape), part.dtype) for k, part in vectors.items()}
+        for name, part in vectors.items():
             low, high = (np.tile(bound, frames) for bound in (part.low, part.high))
-            stacked[name] = gym.spaces.Box(low, high, dtype=part.dtype)
-        self._set_space(gym.spaces.Dict(stacked) if isinstance(space, gym.spaces.Dict) else stacked[OBSERVATION])
+            parts[name] = gym.spaces.Box(low, high, dtype=part.dtype)
+        self._set_space(gym.spaces.Dict(parts) if isinstance(space, gym.spaces.Dict) else parts[OBSERVATION])
 
     def begin(self, observations: Any, lanes: np.ndarray, seeds: list[int | None]) -> None:
         """Fill the lanes' stacks with their first vector."""
-        for name, vectors in named(observations).items():
-            self._stacks[name][lanes] = vectors[:, None]
+        for name, stack in self._stacks.items():
+            stack[lanes] = named(observations)[name][:, None]
 
     def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:
         """Put a vector on each stack."""
-        for name, vectors in named(observations).items():
-            stack = self._stacks[name]
+        for name, stack in self._stacks.items():
             stack[:, :-1] = stack[:, 1:]
-            stack[:, -1] = vectors
+            stack[:, -1] = named(observations)[name]
 
     def wrap(self, observations: Any, lanes: np.ndarray | slice) -> Any:
-        """Return a copy of the lanes' stacks."""
+        """Return the lanes' observations with a copy of their stacks."""
         stacks = {name: np.array(each[lanes]) for name, each in self._stacks.items()}  # (n, K, V)
         flat = {name: each.reshape(len(each), -1) for name, each in stacks.items()}  # (n, K * V)
-        return flat if isinstance(observations, dict) else flat[OBSERVATION]
+        return {**observations, **flat} if isinstance(observations, dict) else flat[OBSERVATION]
 
 
 class StepEncoding(SameStepWrapper):
@@ -450,6 +480,12 @@ def _batched(observations: np.ndarray) -> Any:
     return np.stack(list(observations))
 
 
+def is_act_task(env: VectorEnv) -> bool:
+    """Return whether the environment is Mortar Mayhem without a clue: all commands are observed all the time."""
+    variant = MORTAR_MAYHEM.get(env.spec.id if env.spec else None)
+    return variant is not None and not variant.clue
+
+
 def stacked(envs: VectorEnv, frames: int) -> VectorEnv:
     """Stack images, or vectors where there are no images."""
     images = any(len(part.shape) == 3 for part in envs.single_observation_space.values())
@@ -459,6 +495,7 @@ def stacked(envs: VectorEnv, frames: int) -> VectorEnv:
 # What flags of RunArgs do to observations, the innermost first: each takes the environments and the flag's value.
 WRAPPERS = {
     "spotlight_perturbation": lambda envs, _: SpotlightPerturbation(envs),
+    "attend_commands": lambda envs, _: CommandList(envs) if is_act_task(envs) else envs,
     "frame_stack": stacked,
     "step_encoding": lambda envs, _: StepEncoding(envs),
     "observe_last_action": lambda envs, _: LastAction(envs),

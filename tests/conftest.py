@@ -2,6 +2,7 @@ import os
 
 os.environ["OMP_NUM_THREADS"] = "1"  # of the programs that tests start, too: as many threads, to the bit the same
 
+import gc
 import importlib
 import random
 from pathlib import Path
@@ -40,6 +41,11 @@ SMALL |= {"trxl_num_heads": 2, "trxl_num_layers": 2, "trxl_memory_length": 7}
 def pytest_xdist_make_scheduler(config, log):
     """Let a process of `-n auto` that has nothing left to do take tests from another, so that all end together."""
     return WorkStealingScheduling(config, log) if config.option.dist == "load" else None
+
+
+def pytest_collection_finish():
+    """Collect garbage among what the tests make, and no more in what stays: PyTorch and thousands of tests."""
+    gc.freeze()
 
 
 def pytest_terminal_summary(terminalreporter):

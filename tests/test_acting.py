@@ -18,7 +18,7 @@ from ppo_utils.environments import envs_for
 from ppo_utils.errors import RunError
 from ppo_utils.evaluation import evaluate
 
-EVERYTHING = {"frame_stack": 3, "step_encoding": True, "observe_last_action": True}
+EVERYTHING = {"attend_commands": True, "frame_stack": 3, "step_encoding": True, "observe_last_action": True}
 NESTED = shows(
     gym.spaces.Dict({"a": gym.spaces.Tuple((gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(3)))}),
     action_space=gym.spaces.MultiDiscrete([2, 3], start=[5, 0]),
@@ -114,7 +114,7 @@ def test_a_step_is_exported_as_documented(trained, script, changes, monkeypatch)
         with torch.no_grad():
             y, hidden = agent.memory.step(memory, agent.encoder(obs))
             agent.memory.advance(memory, hidden)
-            policy, value, _ = agent.heads(y)
+            policy, value, _ = agent.heads(y, obs)
             found_logits, found_value, *state = step(obs, *state)
         for found_branch, branch in zip(found_logits, policy, strict=True):
             assert found_branch == pytest.approx(branch.logits, abs=1e-6), t
@@ -134,7 +134,7 @@ def test_most_probable_actions(played, script):
     obs = {name: part[0] for name, part in run.rollout.obs.items()}
     states = [agent.memory.begin_rollout(fresh, 2) for _ in range(2)]
     with torch.no_grad():
-        policy, values, _ = agent.heads(agent.memory.step(states[0], agent.encoder(obs))[0])
+        policy, values, _ = agent.heads(agent.memory.step(states[0], agent.encoder(obs))[0], obs)
         actions, log_probs, found = agent.get_action_and_value(obs, states[0], deterministic=True)
         agent.get_action_and_value(obs, states[1])
     wanted = [branch.logits.max(-1) for branch in policy]

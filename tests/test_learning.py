@@ -44,7 +44,8 @@ def test_every_agent_s_command_can_be_parsed(task, agent):
     args = learning.plan(learning.Config(steps=6_000_000), learning.TASKS[task], agent, 2).args
     assert args.total_timesteps == args.anneal_steps == 6_000_000
     assert args.refresh_memory == ("refreshed" in agent)
-    of_a_preset = agent.startswith(("TrXL, preset", "TrXL, Muon"))  # the thesis' queries do not know their step
+    # The thesis' queries do not know their step.
+    of_a_preset = agent.startswith(("TrXL, preset", "TrXL, Muon", "TrXL, laptop"))
     assert getattr(args, "trxl_query_position", False) == of_a_preset
     assert getattr(args, "trxl_memory_gradient", False) == ("gradient" in agent or of_a_preset)
     assert getattr(args, "trxl_gate", None) == {"TrXL": "none", "GTrXL": "gru"}.get(agent.split(",")[0])

@@ -53,9 +53,9 @@ def recompute(run):
     rollout = run.rollout
     pieces = run.agent.memory.cut(rollout.done.cpu())
     index = pieces.flat_index()
-    x = run.agent.encoder({name: part.flatten(0, 1)[index] for name, part in rollout.obs.items()})
+    obs = {name: part.flatten(0, 1)[index] for name, part in rollout.obs.items()}
     actions = rollout.actions.flatten(0, 1)[index]
-    _, log_probs, values, _ = run.agent.evaluate_actions(x, actions, pieces, rollout.memory)
+    _, log_probs, values, _ = run.agent.evaluate_actions(run.agent.encoder(obs), obs, actions, pieces, rollout.memory)
     return index, (log_probs - rollout.log_probs.flatten(0, 1)[index]).exp(), values
 
 
@@ -72,6 +72,7 @@ def test_presets_and_network_flags_are_flags(script):
         *(("CueRecall-v0", "pixels", memory) for memory in MEMORIES),  # episodes end inside a rollout
         *(("Endless-MortarMayhem-v0", "vector", memory) for memory in MEMORIES),  # longer than a window of 40
         *(("MortarMayhemB-Grid-v0", "pixels", memory) for memory in FEW),
+        *(("MortarMayhemB-Grid-v0", "vector", {**memory, "attend_commands": True}) for memory in (FEW[0], FEW[3])),
     ],
     ids=lambda value: name_of(value) if isinstance(value, dict) else value,
 )
@@ -91,7 +92,7 @@ def test_ratio_is_one_for_every_sample(played, env_id, obs_type, memory):
 
 @each_memory(MEMORIES)
 def test_ratio_is_nearly_one_in_bfloat16(played, memory):
-    changes = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector", "amp": True}
+    changes = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector", "attend_commands": True, "amp": True}
     _, run, *_ = played(iterations=3, weights_scale=3.0, **changes, **memory)
     with torch.autocast("cpu", torch.bfloat16):
         _, ratio, values = recompute(run)

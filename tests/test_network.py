@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import nn
 
 import ppo_gru
@@ -33,7 +34,7 @@ def test_the_value_s_gain_at_initialization(script):
     for gain in (1.0, 0.25, 0.0):
         torch.manual_seed(1)
         agent = script.Agent(PIXELS, [4], script.Args(value_init_gain=gain))
-        values.append(agent.heads(torch.linspace(-1, 1, 4 * agent.memory.width).reshape(4, -1))[1])
+        values.append(agent.heads(torch.linspace(-1, 1, 4 * agent.memory.width).reshape(4, -1), {})[1])
     torch.testing.assert_close(values[1], values[0] / 4)
     assert values[0].any()
     assert not values[2].any()
@@ -91,6 +92,7 @@ def test_the_optimizer(tiny, opened, script):
 @pytest.mark.parametrize("script", [ppo_gru, ppo_trxl])
 def test_muon_has_the_matrices_between_hidden_layers(tiny, opened, script):
     changes = {"env_id": "MortarMayhemB-Grid-v0", "reconstruction_coef": 0.1, "ground_truth_coef": 0.1}
+    changes |= {"attend_commands": True}
     changes |= {"trxl_gate": "gru", "trxl_positional_encoding": "learned"} if script is ppo_trxl else {}
     run = opened(script, tiny(script, optimizer="muon", **changes))
     adamw, muon = run.optimizers
@@ -100,6 +102,7 @@ def test_muon_has_the_matrices_between_hidden_layers(tiny, opened, script):
     assert len(theirs["params"]) + len(group["params"]) == len(names)
     assert {*theirs["params"], *group["params"]} == {*names}
     common = {"encoder.embedding.weight", "heads.trunk.weight", "heads.policy.0.weight", "heads.value.0.weight"}
+    common |= {"heads.scores.commands.0.weight"}
     blocks = [f"memory.blocks.{k}." for k in range(2)] if script is ppo_trxl else []
     inside = [f"attention.{each}" for each in ("query", "key", "value", "output")] + ["projection"]
     gates = ("merge_attention", "merge_projection")
@@ -224,12 +227,43 @@ def test_batches_are_rounded_up_in_bfloat16_which_changes_nothing():
         torch.testing.assert_close(got, want, rtol=0, atol=0)
 
 
+LIST = {"observation": gym.spaces.Box(0, 1, (5,)), "commands": gym.spaces.Box(0, 1, (4, 3))}
+
+
+@pytest.mark.parametrize(("script", "width"), [(ppo_gru, {"hidden_size": 8}), (ppo_trxl, {"trxl_dim": 8})])
+def test_heads_read_a_list_row_by_row(script, width):
+    """Attention with a query of the memory's output: a mean of the rows, by the softmax of their normalized scores."""
+    torch.manual_seed(0)
+    agent = script.Agent(gym.spaces.Dict(LIST), [3], script.Args(**width, trunk_size=6))
+    x, lists = torch.randn(7, 8), {"commands": torch.rand(7, 4, 3)}
+    hidden, last = agent.heads.scores["commands"][0], agent.heads.scores["commands"][2]
+    scores = F.relu(x @ hidden.weight.T + hidden.bias) @ last.weight.T + last.bias
+    scores = (scores - scores.mean(1, keepdim=True)) / (scores.var(1, correction=0, keepdim=True) + 1e-5).sqrt()
+    weights = scores.exp() / scores.exp().sum(1, keepdim=True)
+    read = sum(weights[:, [row]] * lists["commands"][:, row] for row in range(4))
+    trunk = agent.heads.trunk
+    wanted = F.relu(torch.cat([x, read], 1) @ trunk.weight.T + trunk.bias)
+    torch.testing.assert_close(agent.heads(x, lists)[2], wanted)
+    torch.testing.assert_close(last.weight @ last.weight.T, torch.eye(4), atol=1e-5, rtol=0)  # gain 1
+
+
+def test_the_memory_does_not_see_a_list():
+    """Nor do weights know of it, where an observation has none."""
+    agent = Agent(gym.spaces.Dict(LIST), [3], Args(hidden_size=8))
+    obs = {"observation": torch.rand(2, 5), "commands": torch.rand(2, 4, 3)}
+    torch.testing.assert_close(agent.encoder(obs), agent.encoder({**obs, "commands": torch.zeros(2, 4, 3)}))
+    bare = Agent(gym.spaces.Dict({"observation": LIST["observation"]}), [3], Args(hidden_size=8))
+    assert {*agent.state_dict()} - {*bare.state_dict()} == {
+        f"heads.scores.commands.{layer}.{kind}" for layer in (0, 2) for kind in ("weight", "bias")
+    }
+
+
 def test_heads_compute_in_float32_with_amp():
     torch.manual_seed(0)
     agent, x = Agent(PIXELS, [4], Args(hidden_size=32, trunk_size=32)), torch.randn(5, 32)
-    wanted = agent.heads(x)
+    wanted = agent.heads(x, {})
     with torch.autocast("cpu", torch.bfloat16):
-        found = agent.heads(x)
+        found = agent.heads(x, {})
     found, wanted = ([policy[0].logits, *others] for policy, *others in (found, wanted))
     for got, want in zip(found, wanted, strict=True):
         torch.testing.assert_close(got, want, rtol=0, atol=0)

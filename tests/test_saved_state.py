@@ -21,6 +21,7 @@ from ppo_utils.video import LaneVideo
 LANES = 3
 WRAPPERS = {
     "frame stack": {"frame_stack": 3},
+    "list": {"attend_commands": True},
     "step encoding": {"step_encoding": True},
     "Fourier features": {"obs_type": "vector", "vector_frequencies": 2},
     "last action": {"observe_last_action": True},

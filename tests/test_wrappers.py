@@ -13,7 +13,9 @@ from players import choices
 
 from memory_gym_envs.drawing import gray
 from memory_gym_envs.searing_spotlights.state import BEND, START, TOWARD
+from ppo_utils.environments import make_envs
 from ppo_utils.wrappers import (
+    CommandList,
     FourierFeatures,
     GrayscaleStack,
     LastAction,
@@ -187,7 +189,8 @@ def test_needs_a_picture(wrapper):
     [
         (GrayscaleStack, {"frames": 0}, "frames must be an integer of at least 1, not 0"),
         (GrayscaleStack, {"frames": 4.0}, "frames"),
-        (VectorStack, {}, "VectorStack needs a vector to observe, or a Dict of vectors, not Box"),
+        (VectorStack, {}, "VectorStack needs a vector to observe, or a Dict with one, not Box"),
+        (CommandList, {}, "CommandList needs what an act task of Mortar Mayhem observes, not MysteryPath"),
         (StepEncoding, {"width": 15}, "width must be an even integer of at least 2, not 15"),
         (StepEncoding, {"width": 0}, "width"),
         (SpotlightPerturbation, {"opacity": 256}, "opacity must be an integer from 0 to 255, not 256"),
@@ -267,6 +270,63 @@ def test_vector_stack_is_gymnasiums_of_single_environments(env_id, frames):
     assert ended > LANES
     with pytest.raises(ValueError, match="frames must be an integer of at least 1, not 0"):
         VectorStack(make(env_id, obs_type="vector"), 0)
+
+
+def test_vector_stack_leaves_other_parts_alone():
+    """Of a Dict, lists and images are as they were, in final observations too."""
+    envs, bare = (CommandList(make("MortarMayhemB-Grid-v0", obs_type="vector")) for _ in range(2))
+    envs = VectorStack(envs, 2)
+    assert envs.single_observation_space["observation"].shape == (30,)
+    assert np.array_equal(envs.reset(seed=0)[0]["commands"], bare.reset(seed=0)[0]["commands"])
+    for left, right in zip(roll(envs, 50), roll(bare, 50), strict=True):
+        assert left[0] in envs.observation_space
+        assert np.array_equal(left[0]["commands"], right[0]["commands"])
+        assert np.array_equal(left[0]["observation"][:, 15:], right[0]["observation"])
+        for (_, last), (_, other) in zip(finals(left[4]), finals(right[4]), strict=True):
+            assert np.array_equal(last["commands"], other["commands"])
+
+
+# ---- a list of commands ----
+
+
+@pytest.mark.parametrize("env_id", ["MortarMayhemB-v0", "MortarMayhemB-Grid-v0"])
+@pytest.mark.parametrize("obs_type", ["vector", "pixels", "grayscale"])
+def test_commands_are_a_part_of_their_own(env_id, obs_type):
+    """Side by side, the parts are what the environment shows."""
+
+    def whole(seen):
+        commands = seen["commands"].reshape(*seen["commands"].shape[:-2], 180)
+        return np.concatenate([seen["observation"], commands], -1) if obs_type == "vector" else commands
+
+    def shown(seen):
+        return seen if obs_type == "vector" else seen["vector_observation"]
+
+    envs, bare, ended = CommandList(make(env_id, obs_type=obs_type)), make(env_id, obs_type=obs_type), 0
+    others = {"observation"} if obs_type == "vector" else {"visual_observation"}
+    assert {*envs.single_observation_space} == {"commands", *others}
+    left, right = envs.reset(seed=4)[0], bare.reset(seed=4)[0]
+    assert np.array_equal(whole(left), shown(right))
+    for left, right in zip(roll(envs, 300), roll(bare, 300), strict=True):
+        assert left[0] in envs.observation_space
+        assert np.array_equal(whole(left[0]), shown(right[0]))
+        if obs_type != "vector":
+            assert np.array_equal(left[0]["visual_observation"], right[0]["visual_observation"])
+        for (_, last), (_, other) in zip(finals(left[4]), finals(right[4]), strict=True):
+            assert np.array_equal(whole(last), shown(other))
+            ended += 1
+        for part in left[0].values():
+            part.fill(0)  # the caller's own
+    assert ended > LANES
+
+
+def test_other_environments_have_no_list():
+    spaces = [
+        make_envs(env_id, 2, obs_type="vector", attend_commands=flag).single_observation_space
+        for env_id in ("MortarMayhem-v0", "CartPole-v1")
+        for flag in (True, False)
+    ]
+    assert spaces[0] == spaces[1]
+    assert spaces[2] == spaces[3]
 
 
 def test_gray():
