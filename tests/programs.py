@@ -1,6 +1,7 @@
 """Programs in processes of their own, forked off the one of the tests: each real, but nothing is imported again."""
 
 import contextlib
+import gc
 import os
 import runpy
 import signal
@@ -31,6 +32,7 @@ class Program:
     def _become(self, function, folder, environ):
         """In the new process: run the function, and end. Nothing of the tests goes on here."""
         code = 1
+        gc.freeze()  # a progress bar that a test has left would end its line here, when it is collected
         with contextlib.suppress(BaseException):
             for number, file in enumerate(self.files, 1):
                 os.dup2(file.fileno(), number)
