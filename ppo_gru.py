@@ -10,8 +10,7 @@ first step of a sequence and no further. The stored states at the cuts of --seq-
 step on; --refresh-memory recomputes them with the current weights before each epoch but the first.
 
 Source: Marco Pleines, "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", dissertation,
-called the thesis below: §5.2 is a section of it, (5.7) an equation. Defaults are the "Final" column of its table 6.1,
-without auxiliary losses.
+called the thesis below: §5.2 is a section, (5.7) an equation. Defaults: table 6.1, "Final", without auxiliary losses.
 
 How to read: section 2 is the training loop, from the top down; 3 to 5 are what it is built from, 4 the memory; 6 makes
 everything. In ppo_utils/ is what does not depend on the algorithm, and faster ways to compute the same.
@@ -664,7 +663,7 @@ class Heads(nn.Module):
     def __init__(self, width: int, lists: dict[str, tuple[int, int]], nvec: list[int], size: int, value_gain: float):
         super().__init__()
         self.nvec = nvec  # number of actions of each branch, as Gymnasium calls it
-        # Rows of an observed list, (rows, columns), are read by attention, whose keys are their positions alone.
+        # An observed list, (rows, columns), is read by attention: the memory's output gives each of its rows a score.
         self.scores = nn.ModuleDict({name: mlp_head(width, rows, 1.0) for name, (rows, _) in lists.items()})
         self.trunk = layer_init(nn.Linear(width + sum(columns for _, columns in lists.values()), size))
         self.policy = mlp_head(size, sum(nvec), 0.1)
@@ -674,7 +673,7 @@ class Heads(nn.Module):
         """Map the memory's output (B, D) and observed lists to each branch's policy, values (B,), features (B, F)."""
         with torch.autocast(x.device.type, enabled=False):  # --amp: bfloat16 is too coarse for values and log-ratios
             x = x.float()
-            # Scores are normalized: no weight vanishes, and with it the gradient that would find its row later.
+            # Normalized scores keep all weights well above 0: a row that is not read yet still gets a gradient.
             weights = {name: F.layer_norm(score(x), [score[-1].out_features]) for name, score in self.scores.items()}
             read = [(weight.softmax(-1)[:, None] @ obs[name])[:, 0] for name, weight in weights.items()]
             features = F.relu(self.trunk(torch.cat([x, *read], -1)))
@@ -759,8 +758,8 @@ class Agent(nn.Module):
     ) -> tuple[list[Categorical], Tensor, Tensor, Tensor]:
         """Recompute, with gradient, what `get_action_and_value` computed at the steps of the pieces.
 
-        x: the steps' encoded observations (B, I). lists: in them. Returns the policy, a distribution of B actions for
-        each branch, the log-probabilities (B, A) of the actions (B, A), values (B,) and features (B, F).
+        x: the steps' encoded observations (B, I). lists: those observed. Returns for each branch a distribution of B
+        actions, the log-probabilities (B, A) of the actions (B, A), values (B,) and features (B, F).
         """
         policy, values, features = self.heads(self.memory.unroll(state, x, pieces), lists)
         return policy, log_probs_of(policy, actions), values, features

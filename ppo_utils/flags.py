@@ -111,7 +111,7 @@ class RunArgs:
     frame_stack: NonNegativeInt = 0
     """observe the last K images, in grayscale, or the last K vectors (0: the current one, in color)"""
     attend_commands: bool = False
-    """of the commands that Mortar Mayhem's act tasks show all at once, read one at a time, by attention"""
+    """read the list of commands of Mortar Mayhem's act tasks row by row, by attention after the memory"""
     step_encoding: bool = False
     """also observe a sinusoidal encoding of the episode's step"""
     observe_last_action: bool = False
