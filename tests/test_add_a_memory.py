@@ -50,9 +50,9 @@ def test_the_memory_of_the_page(tmp_path):
     tests = said(lambda: sys.exit(pytest.main(["-p", "no:cacheprovider", *files, "-k", "mingru"])))
     assert int(re.search(r"(\d+) passed", tests).group(1)) >= 19
 
-    few = ["--seeds", "1", "--steps", "2e4", "--evaluations", "1", "--test-levels", "5"]
-    tasks = ("--tasks", "mortar-mayhem", "--agents", "ppo_mingru.py")
-    assert "\n| ppo_mingru.py | 0." in said(command(tmp_path / "benchmarks/learning.py", *tasks, *few))
+    few = ["--seeds", "1", "--steps", "3e3", "--evaluations", "1", "--test-levels", "5"]
+    tasks = ("--tasks", "mortar-mayhem", "--agents", "ppo_mingru.py --num-envs 16")
+    assert "\n| ppo_mingru.py, num envs 16 | 0." in said(command(tmp_path / "benchmarks/learning.py", *tasks, *few))
     (model,) = tmp_path.glob("learning/runs/*/model.pt")
     scores = said(command(tmp_path / "evaluate.py", model, "--levels", "1", "--repeats", "1"))
-    assert "| ppo_mingru-py | 1 |" in scores
+    assert "| ppo_mingru-py-num-envs-16 | 1 |" in scores
