@@ -1,4 +1,4 @@
-"""How many steps `--preset laptop` takes, and how fast it is, beside the one before: the table of docs/tuning.md.
+"""How many steps `--preset laptop` takes, and how fast it is: the table of docs/tuning.md.
 
     python benchmarks/tuning.py
 
@@ -24,15 +24,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of 
 import learning
 import tables
 from ppo_utils.run_logs import align, read_run
-from suites import LAPTOP, TASKS, WIDE
+from suites import LAPTOP, TASKS
 
 RESULTS, SPEEDS = (Path(__file__).with_name(name) for name in ("results", "steps_per_second.csv"))
-AGENTS = {  # by script and preset: the suite and the agent
-    ("ppo_trxl.py", "AdamW"): ("full", f"TrXL, preset {WIDE}"),
-    ("ppo_trxl.py", "Muon"): ("laptop", "TrXL, Muon"),
-    ("ppo_gru.py", "AdamW"): ("full", "GRU"),
-    ("ppo_gru.py", "Muon"): ("laptop", "GRU, Muon"),
-}
+AGENTS = {"ppo_trxl.py": "TrXL, Muon", "ppo_gru.py": "GRU, Muon"}  # by script
 STEPS = 81_920  # of a training that is measured
 
 
@@ -44,19 +39,19 @@ class Config:
     """the tasks whose steps per second are measured again on this machine, within two minutes a task"""
 
 
-def plans_of(task: str, suite: str, agent: str) -> dict[tuple[str, str, int], learning.Plan]:
+def plans_of(task: str, agent: str) -> dict[tuple[str, str, int], learning.Plan]:
     """Return the trainings of an agent, one a seed."""
-    return learning.plans_of(learning.Config(suite=suite, tasks=(task,), agents=(agent,), results=RESULTS))
+    return learning.plans_of(learning.Config(suite="laptop", tasks=(task,), agents=(agent,), results=RESULTS))
 
 
-def read_speeds() -> dict[tuple[str, str, str], float]:
-    """Return the steps per second that were measured, by task, script and preset."""
+def read_speeds() -> dict[tuple[str, str], float]:
+    """Return the steps per second that were measured, by task and script."""
     with SPEEDS.open(newline="") as file:
         return {tuple(key): float(speed) for *key, speed in [*csv.reader(file)][1:]}
 
 
 def measure_speeds(tasks: tuple[str, ...]) -> None:
-    """Train for a few iterations with each script and preset in turn, on one core, and write their steps per second.
+    """Train for a few iterations with each script in turn, on one core, and write their steps per second.
 
     Raises SystemExit for tasks that this preset was not trained on.
     """
@@ -65,17 +60,17 @@ def measure_speeds(tasks: tuple[str, ...]) -> None:
     speeds = read_speeds()
     flags = ["--no-save-model", "--eval-interval", "0", "--total-timesteps", str(STEPS)]
     for task in tasks:
-        for (script, preset), (suite, agent) in AGENTS.items():
-            plan = next(iter(plans_of(task, suite, agent).values()))
+        for script, agent in AGENTS.items():
+            plan = next(iter(plans_of(task, agent).values()))
             with tempfile.TemporaryDirectory() as folder:
                 env = {**os.environ, "OMP_NUM_THREADS": "1"}
                 subprocess.run([*plan.command, *flags], check=True, cwd=folder, env=env)
                 (run,) = (Path(folder) / "runs").iterdir()
-                speeds[task, script, preset] = read_run(str(run)).curves["charts/SPS"][1][-1].item()
+                speeds[task, script] = read_run(str(run)).curves["charts/SPS"][1][-1].item()
     with SPEEDS.open("w", newline="") as file:  # at the end: a failed training loses nothing
         in_order = sorted(speeds.items(), key=lambda each: [*LAPTOP].index(each[0][0]))
         rows = [(*key, round(speed)) for key, speed in in_order]
-        csv.writer(file).writerows([("task", "script", "preset", "steps_per_second"), *rows])
+        csv.writer(file).writerows([("task", "script", "steps_per_second"), *rows])
 
 
 def steps_to(goal: float, steps: np.ndarray, scores: np.ndarray) -> str:
@@ -84,32 +79,29 @@ def steps_to(goal: float, steps: np.ndarray, scores: np.ndarray) -> str:
     return f"{steps[there[0]] / 1e6:.2f} M" if there.size else ""
 
 
-def table(speeds: dict[tuple[str, str, str], float]) -> str:
-    """Return a row for each task and script: score, steps to 0.5 and 0.9 of the best, speed, and what AdamW had.
+def table(speeds: dict[tuple[str, str], float]) -> str:
+    """Return a row for each task and script: score, steps to 0.5 and 0.9 of the best, and speed.
 
     The best is the best possible score, or where there is no bound the highest mean of these agents. Raises SystemExit
     where an agent has no results.
     """
-    lines = ["| task | script | steps | score | steps to 0.5 | to 0.9 | steps/s | AdamW: to 0.5 | steps/s |"]
-    lines.append("|---|---|---:|---:|---:|---:|---:|---:|---:|")
-    for name in dict.fromkeys(task for task, _, _ in speeds):
+    lines = ["| task | script | steps | score | steps to 0.5 | to 0.9 | steps/s |"]
+    lines.append("|---|---|---:|---:|---:|---:|---:|")
+    for name in dict.fromkeys(task for task, _ in speeds):
         runs_of = {
-            key: learning.results_of(learning.Config(results=RESULTS), plans_of(name, *agent))[name].popitem()[1]
-            for key, agent in AGENTS.items()
+            script: learning.results_of(learning.Config(results=RESULTS), plans_of(name, agent))[name].popitem()[1]
+            for script, agent in AGENTS.items()
         }
-        if lacking := [" with ".join(key) for key, runs in runs_of.items() if not runs]:
+        if lacking := [script for script, runs in runs_of.items() if not runs]:
             raise SystemExit(f"{RESULTS} has no results of {lacking[0]} in {name}; learning.py trains what is missing")
         task = TASKS[name]
-        curves = {key: align([run.curves[f"eval/{task.score}"] for run in runs]) for key, runs in runs_of.items()}
+        curves = {script: align([run.curves[f"eval/{task.score}"] for run in runs]) for script, runs in runs_of.items()}
         best = task.best_score or max(scores[-1].mean() for _, scores in curves.values())
-        for script in ("ppo_trxl.py", "ppo_gru.py"):
-            muon, adamw = curves[script, "Muon"], curves[script, "AdamW"]
-            fast, slow = speeds[name, script, "Muon"], speeds[name, script, "AdamW"]
-            total = int(runs_of[script, "Muon"][0].args["total_timesteps"])
-            cells = [name, f"`{script}`", f"{total / 1e6:g} M", tables.mean_and_error(muon[1][-1])]
-            cells += [steps_to(0.5 * best, *muon), steps_to(0.9 * best, *muon), f"{fast:,.0f}"]
-            cells += [steps_to(0.5 * best, *adamw), f"{slow:,.0f}"]
-            lines.append(f"| {' | '.join(cells)} |")
+        for script, (steps, scores) in curves.items():
+            total = int(runs_of[script][0].args["total_timesteps"])
+            cells = [name, f"`{script}`", f"{total / 1e6:g} M", tables.mean_and_error(scores[-1])]
+            cells += [steps_to(share * best, steps, scores) for share in (0.5, 0.9)]
+            lines.append(f"| {' | '.join([*cells, f'{speeds[name, script]:,.0f}'])} |")
     return "\n".join(lines)
 
 

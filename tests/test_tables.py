@@ -198,8 +198,8 @@ def test_what_the_thesis_reports_is_of_the_ten_tasks():
 
 def test_a_table_of_minutes_needs_results(tmp_path, monkeypatch):
     monkeypatch.setattr(tuning, "RESULTS", tmp_path)
-    task, script, preset = next(iter(tuning.read_speeds()))
-    with pytest.raises(SystemExit, match=f"no results of {script} with {preset} in {task}; learning.py trains"):
+    task, script = next(iter(tuning.read_speeds()))
+    with pytest.raises(SystemExit, match=f"no results of {script} in {task}; learning.py trains"):
         tuning.main(tuning.Config())
 
 
@@ -212,13 +212,13 @@ def test_the_axis_of_a_single_seed(tmp_path, monkeypatch):
     assert [axis.get_ylim() for axis in drawn[0].axes] == [(0, 1), (0, 7)]
 
 
-HEAD = "task,script,preset,steps_per_second\n"
+HEAD = "task,script,steps_per_second\n"
 
 
 def test_a_speed_is_that_of_the_whole_training_on_one_core(tmp_path, monkeypatch):
     """Other tasks keep theirs, and all stay until all are measured."""
-    kept = [f"SearingSpotlights-v0,{','.join(key)},7" for key in tuning.AGENTS]
-    old = [f"MortarMayhem-Grid-v0,{','.join(key)},0" for key in reversed(tuning.AGENTS)]
+    kept = [f"SearingSpotlights-v0,{script},7" for script in tuning.AGENTS]
+    old = [f"MortarMayhem-Grid-v0,{script},0" for script in reversed(tuning.AGENTS)]
     before = HEAD + "\n".join([*kept, *old])
     monkeypatch.setattr(tuning, "SPEEDS", tmp_path / "speeds.csv")
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
@@ -239,8 +239,8 @@ def test_a_speed_is_that_of_the_whole_training_on_one_core(tmp_path, monkeypatch
     tuning.main(tuning.Config(measure=("MortarMayhem-Grid-v0",)))
     head, *rows = tuning.SPEEDS.read_text().splitlines()
     assert f"{head}\n" == HEAD
-    assert sorted(rows[:4]) == sorted(f"MortarMayhem-Grid-v0,{','.join(key)},20" for key in tuning.AGENTS)
-    assert rows[4:] == kept
+    assert sorted(rows[:2]) == sorted(f"MortarMayhem-Grid-v0,{script},20" for script in tuning.AGENTS)
+    assert rows[2:] == kept
     with pytest.raises(SystemExit, match="there is no 'mortar-mayhem'; there are MortarMayhem"):
         measure(("mortar-mayhem",))
 
@@ -256,8 +256,8 @@ def test_a_speed_is_measured(tmp_path, monkeypatch):
     monkeypatch.setattr(tuning, "STEPS", 256)
     tuning.SPEEDS.write_text(HEAD)
     agent = "TrXL, Muon --num-envs 4 --num-steps 32 --num-minibatches 2"
-    monkeypatch.setattr(tuning, "AGENTS", {("ppo_trxl.py", "Muon"): ("laptop", agent)})
+    monkeypatch.setattr(tuning, "AGENTS", {"ppo_trxl.py": agent})
     tuning.measure_speeds(("MortarMayhem-Grid-v0",))
     ((key, speed),) = tuning.read_speeds().items()
-    assert key == ("MortarMayhem-Grid-v0", "ppo_trxl.py", "Muon")
+    assert key == ("MortarMayhem-Grid-v0", "ppo_trxl.py")
     assert speed > 0
