@@ -2,7 +2,7 @@
 
     python benchmarks/bounds.py
 
-For comparison with agents. The player, of tests/envs/players.py, knows the target and walks to it. In Searing
+For comparison with agents. The player, of memory_gym_envs.players, knows the target and walks to it. In Searing
 Spotlights it goes straight through the light. In the endless tasks it stops after MAX_STEPS steps, or where the path of
 Endless Mystery Path goes left, where nobody can follow it. Writes benchmarks/bounds.csv; tables of learning.py have its
 scores beside the agents'.
@@ -18,11 +18,9 @@ import numpy as np
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/envs"))
-
-from players import choices, player
 
 from learning import FIRST_TEST_LEVEL, Training
+from memory_gym_envs.players import choices, player
 from suites import FULL, SMALL, Task
 from tables import BOUNDS
 

@@ -139,7 +139,7 @@ def draw_number(rng: np.random.Generator, option: Any) -> float:
 
 def choose_actions(rng: np.random.Generator, env: gym.Env) -> Callable[[int], Any]:
     """The actions of one episode, which are held for so many steps, more or less."""
-    from players import stumbling
+    from memory_gym_envs.players import stumbling
 
     stumble, hold, held = np.array([rng.choice([0.0, 0.05, 0.3, 1.0])]), rng.choice([1, 1, 4, 20]), [None]
 
@@ -235,7 +235,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first episode (default: 0)")
     parser.add_argument("--ids", nargs="+", help="ids to draw from (default: all)")
     args = parser.parse_args()
-    sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "envs")]
+    sys.path.insert(0, str(ROOT))
     with tempfile.TemporaryDirectory() as folder:
         fuzz = Fuzz(args.original or make_original(folder), args.seed)
         number, end = args.first, time.monotonic() + 60 * args.minutes

@@ -185,6 +185,10 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         """The lanes' ended episodes in numbers, each (n,): the final info but for the ground truth."""
         raise NotImplementedError
 
+    def longest_episode(self, lane: int) -> int:
+        """The steps after which the lane's episode is over at the latest, under its reset options; -1: no limit."""
+        return self.settings[lane]["max_steps"]
+
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Draws the lane's ground truth over its magnified frame, in place."""
 

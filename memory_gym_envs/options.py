@@ -61,11 +61,14 @@ class Option:
         return 0 if self.empty else 1
 
     def parse(self, value: Any) -> Any:
-        """Returns the value as plain Python (bool, int, float or tuple of int), or None if it is not allowed."""
+        """Returns the value as plain Python (bool, int, float or tuple of int), or None if it is not allowed.
+
+        A whole float is an integer, and a range is a list.
+        """
         if self.kind == "bool":
             return bool(value) if isinstance(value, (bool, np.bool_)) else None
         if self.kind == "ints":
-            listed = isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.ndim == 1)
+            listed = isinstance(value, (list, tuple, range)) or (isinstance(value, np.ndarray) and value.ndim == 1)
             if not listed or not self._shortest <= len(value) <= LONGEST_LIST:
                 return None
             numbers_ = tuple(self._number(item, int) for item in value)
@@ -73,12 +76,13 @@ class Option:
         return self._number(value, int if self.kind == "int" else float)
 
     def _number(self, value: Any, of: type) -> Any:
-        abstract = numbers.Integral if of is int else numbers.Real
-        if isinstance(value, (bool, np.bool_)) or not isinstance(value, abstract):
+        if isinstance(value, (bool, np.bool_)) or not isinstance(value, numbers.Real):
             return None
         try:
             number = of(value)
-        except OverflowError:  # an integer that no float can hold
+        except (OverflowError, ValueError):  # an integer that no float can hold, or infinity or NaN as an integer
+            return None
+        if of is int and number != value:
             return None
         low, high = self.bounds
         return number if low <= number <= high or number in self.also else None

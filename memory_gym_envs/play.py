@@ -95,10 +95,9 @@ class Game:
         self.tapped = []
         self.steps, self.returned = self.steps + 1, self.returned + self.reward
         if terminated or truncated:
-            numbers = [
-                f"{key} {value:g}" for key, value in info.items() if key not in ("ground_truth", "reward", "length")
-            ]
-            self.ending = f"{'terminated' if terminated else 'truncated (max_steps)'}: {', '.join(numbers)}"
+            shown = info.keys() - {"ground_truth", "reward", "length", "is_success"}  # the last is success once more
+            numbers = ", ".join(f"{key} {value:g}" for key, value in info.items() if key in shown)
+            self.ending = f"{'terminated' if terminated else 'truncated (max_steps)'}: {numbers}"
 
     def text(self) -> str:
         """What there is to tell, in lines."""

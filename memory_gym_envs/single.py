@@ -103,6 +103,11 @@ class MemoryGymEnv(gym.Env):
         return dict(self.batch.defaults)
 
     @property
+    def max_episode_steps(self) -> int:
+        """The steps after which this episode is over at the latest; -1: no limit. Known before the first reset too."""
+        return self.batch.longest_episode(0)
+
+    @property
     def reset_params(self) -> dict[str, Any]:
         """The reset options of this episode, those that were not given included."""
         return dict(self.batch.settings[0])

@@ -72,8 +72,9 @@ def final_numbers(infos: dict[str, Any], ended: np.ndarray) -> dict[str, np.ndar
     numbers = {}
     for lane in np.flatnonzero(ended).tolist():
         info = final_info_of(infos, lane)
-        if "carried_out" in info:
-            info = {name: value for name, value in info.items() if name not in COUNT_A_FAILED_COMMAND}
+        left_out = COUNT_A_FAILED_COMMAND if "carried_out" in info else ()
+        left_out += ("is_success",) if "success" in info else ()  # the same once more, for Stable-Baselines3
+        info = {name: value for name, value in info.items() if name not in left_out}
         for name, value in info.items():
             number = as_number(value)
             if number is not None:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.wrappers.vector import ClipReward
-from helpers import EACH, EACH_OBS, HASTY, ONE_OBS, check_same
-from players import FAMILY, stumbling
+from helpers import EACH, EACH_OBS, FAMILY, HASTY, ONE_OBS, check_same
 from test_lanes import CHANGED, OPTIONS
 
+from memory_gym_envs.players import stumbling
 from memory_gym_envs.saving import BIT_GENERATORS, plain, restored
 from ppo_utils.environments import load_state, make_envs, save_state
 from ppo_utils.video import LaneVideo

@@ -9,9 +9,9 @@ import pytest
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import FrameStackObservation, TransformObservation
-from players import choices
 
 from memory_gym_envs.drawing import gray
+from memory_gym_envs.players import choices
 from memory_gym_envs.searing_spotlights.state import BEND, START, TOWARD
 from ppo_utils.environments import make_envs
 from ppo_utils.wrappers import (

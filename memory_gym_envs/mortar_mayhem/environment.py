@@ -93,7 +93,7 @@ class MortarMayhem(MemoryGymVectorEnv):
     `length`, `commands_completed` and `success` (in the endless id `max_command_sequence`, the length of the longest
     completed sequence). commands_completed is a share of the sequence, in the endless id a number of commands. The
     finite ids add `carried_out`, the share of commands whose tile the agent was on when all others caught fire, which a
-    failed last command does not raise.
+    failed last command does not raise, and `is_success`, whether that is all of them.
 
     ## Arguments
 
@@ -291,7 +291,17 @@ class MortarMayhem(MemoryGymVectorEnv):
         failed = s.burning[lanes] & ~on_target(s, lanes) & ~success
         share = (s.current[lanes] - failed) / s.count[lanes]
         numbers |= {"success": success.astype(np.int64), "commands_completed": share}
-        return numbers | {"carried_out": s.completed[lanes] / s.count[lanes]}
+        carried_out = s.completed[lanes] / s.count[lanes]
+        return numbers | {"carried_out": carried_out, "is_success": carried_out == 1}
+
+    def longest_episode(self, lane: int) -> int:
+        """The steps after which the lane's episode is over at the latest, under its reset options; -1: no limit."""
+        if self.variant.endless:
+            return super().longest_episode(lane)
+        values = {name: max(value) for name, value in self.settings[lane].items() if isinstance(value, tuple)}
+        shown = values.get("command_show_duration", 0) + values.get("command_show_delay", 0)
+        carried_out = values["explosion_delay"] + values["explosion_duration"]
+        return values["command_count"] * (shown + carried_out) - values["explosion_duration"] + 1
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Circles the lane's target tile in its magnified frame, in place."""

@@ -100,9 +100,9 @@ class MysteryPath(MemoryGymVectorEnv):
 
     `ground_truth`: one-hot, the direction of the path's next tile from where the agent last was on the path: east,
     north, south, west, (4,); at the goal, the direction that led there. Endless id: east, north, south, (3,); where the
-    path goes west, the direction stays as it was. At an episode's end also `reward`, `length`, `num_fails` and
-    `success`; in the endless id, instead of success, `tiles_visited` and `max_x`, the rightmost column of the path that
-    the agent reached.
+    path goes west, the direction stays as it was. At an episode's end also `reward`, `length`, `num_fails`,
+    `success` and `is_success`; in the endless id, instead of these two, `tiles_visited` and `max_x`, the rightmost
+    column of the path that the agent reached.
 
     ## Arguments
 
@@ -287,8 +287,8 @@ class MysteryPath(MemoryGymVectorEnv):
         if self.variant.endless:
             places = {"max_x": s.max_column[lanes], "tiles_visited": s.visited[lanes]}
             return numbers | {"num_fails": s.fails[lanes]} | places
-        success = (s.path_step[lanes] == s.path_length[lanes]).astype(np.int64)
-        return numbers | {"success": success, "num_fails": s.fails[lanes]}
+        success = s.path_step[lanes] == s.path_length[lanes]
+        return numbers | {"success": success.astype(np.int64), "num_fails": s.fails[lanes], "is_success": success}
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Draws the path in white, its origin and transition tiles blue, its goal green, walls red, then the agent."""

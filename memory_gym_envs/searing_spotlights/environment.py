@@ -85,7 +85,8 @@ class SearingSpotlights(MemoryGymVectorEnv):
     `ground_truth` (6,): x and y of the agent, of the first coin left and of the exit; the endless id (4,) without the
     exit. In pixels over 84, so an agent that starts outside the screen has up to 86 / 84; 0 for what is not there. At
     an episode's end also `reward`, `length`, `agent_health` (share left, negative if the last hit took more than that),
-    `coins_collected` (a share, 1 if there were none; in the endless id a number) and, in the finite id, `success`.
+    `coins_collected` (a share, 1 if there were none; in the endless id a number) and, in the finite id, `success` and
+    `is_success`.
 
     ## Arguments
 
@@ -294,7 +295,8 @@ class SearingSpotlights(MemoryGymVectorEnv):
             return numbers | {"coins_collected": s.collected[lanes]}
         coins = s.num_coins[lanes]
         share = np.where(coins > 0, s.collected[lanes] / np.maximum(coins, 1), 1.0)
-        return numbers | {"coins_collected": share, "success": s.success[lanes]}
+        success = s.success[lanes]
+        return numbers | {"coins_collected": share, "success": success, "is_success": success == 1}
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Lights everything below the bar, and circles the spotlights."""

@@ -5,11 +5,13 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from players import choices
 
+import memory_gym_envs
 from memory_gym_envs import IDS, MortarMayhem, MysteryPath, SearingSpotlights
+from memory_gym_envs.players import choices
 
 LANES = 4
+FAMILY = {env_id: family for family in memory_gym_envs.FAMILIES for env_id in family.variants}
 EACH = pytest.mark.parametrize("env_id", IDS)
 MORTAR = pytest.mark.parametrize("env_id", MortarMayhem.variants)
 SPOTLIGHTS = pytest.mark.parametrize("env_id", SearingSpotlights.variants)

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from helpers import EACH, EACH_OBS, FAMILIES, HASTY, LANES, check_same, make, picture, roll
-from players import FAMILY
+from helpers import EACH, EACH_OBS, FAMILIES, FAMILY, HASTY, LANES, check_same, make, picture, roll
 
 import memory_gym_envs
 

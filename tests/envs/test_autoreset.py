@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
-from helpers import EACH, HASTY, ONE_OBS, check_same, make, roll
-from players import FAMILY
+from helpers import EACH, FAMILY, HASTY, ONE_OBS, check_same, make, roll
 from test_lanes import CHANGED, LANES, LEVELS, OPTIONS, Told, check_resets_and_steps, mixed_actions, reset_both
 
 from memory_gym_envs.old_gymnasium import warn_of

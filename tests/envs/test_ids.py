@@ -7,8 +7,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import pytest
-from helpers import EACH, check_same
-from players import FAMILY
+from helpers import EACH, FAMILY, check_same
 
 import memory_gym_envs
 from memory_gym_envs import MemoryGymEnv, MemoryGymVectorEnv, MysteryPath

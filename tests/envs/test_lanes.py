@@ -6,10 +6,10 @@
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from helpers import EACH_OBS, HASTY, ONE_OBS, check_same, lane_of, make, roll
-from players import FAMILY, stumbling
+from helpers import EACH_OBS, FAMILY, HASTY, ONE_OBS, check_same, lane_of, make, roll
 
 from memory_gym_envs import MortarMayhem, MysteryPath, SearingSpotlights
+from memory_gym_envs.players import stumbling
 
 LANES = 3
 OPTIONS = {

@@ -3,9 +3,9 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from players import player
 
 from level_statistics import THESIS, fewest_steps, path_lengths, spotlight_lengths
+from memory_gym_envs.players import player
 
 
 def test_optimal_length_of_spotlight_levels():

@@ -5,7 +5,6 @@ from itertools import pairwise
 import gymnasium as gym
 import numpy as np
 import pytest
-from players import player, stumbling, turn_or_walk
 
 from memory_gym_envs import MysteryPath
 from memory_gym_envs.character import BODY, PAD
@@ -13,6 +12,7 @@ from memory_gym_envs.mystery_path.levels import FIRST_SEGMENTS, read_ahead, samp
 from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE
 from memory_gym_envs.mystery_path.rules import trail
 from memory_gym_envs.mystery_path.state import EAST, NORTH, PIT, PIT_ROWS, ROWS, SOUTH, WEST
+from memory_gym_envs.players import player, stumbling, turn_or_walk
 
 EACH = pytest.mark.parametrize("env_id", MysteryPath.variants)
 FINITE = pytest.mark.parametrize("env_id", ["MysteryPath-v0", "MysteryPath-Grid-v0"])

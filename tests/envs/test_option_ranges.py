@@ -10,12 +10,12 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import EACH, EACH_OBS
+from helpers import EACH, EACH_OBS, FAMILY
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from players import FAMILY, stumbling
 
 from memory_gym_envs.options import LONGEST_LIST, brief
+from memory_gym_envs.players import stumbling
 
 TIMES = int(os.environ.get("MORE_EXAMPLES", 1))
 LANES, STEPS = 5, 120
@@ -120,7 +120,7 @@ def wrong_numbers(option):
     if option.kind == "float":
         below, above = st.floats(max_value=low, exclude_max=True), st.floats(min_value=high, exclude_min=True)
         return outside | below | above | st.just(np.nan)
-    return outside | st.floats()  # not even whole ones
+    return outside | st.floats().filter(lambda number: not number.is_integer())
 
 
 @EACH

@@ -5,8 +5,7 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import EACH, HASTY, LANES, check_same, make, roll
-from players import FAMILY
+from helpers import EACH, FAMILY, HASTY, LANES, check_same, make, roll
 
 from memory_gym_envs import MortarMayhem, MysteryPath, SearingSpotlights
 
@@ -49,6 +48,17 @@ def test_options_that_an_environment_is_made_with(env_id):
         make(env_id, options={"agent_skale": 1})
 
 
+@pytest.mark.parametrize(
+    "counts", [[2.0, 3.0], range(2, 4), np.array([2.0, 3.0]), (np.float32(2), np.int8(3))], ids=str
+)
+def test_whole_floats_and_ranges(counts):
+    """They are what they stand for: integers, and lists of them."""
+    env = gym.make("MortarMayhem-Grid-v0").unwrapped
+    env.reset(seed=0, options={"command_count": counts, "allowed_commands": 4.0})
+    assert (env.reset_params["command_count"], env.reset_params["allowed_commands"]) == ((2, 3), 4)
+    assert {type(each) for each in (*env.reset_params["command_count"], env.reset_params["allowed_commands"])} == {int}
+
+
 WRONG_ANYWHERE = [
     ({"agent_skale": 1.0}, "'agent_skale'.*'agent_scale'.*a number from 0.04 to 1.0"),
     ({"agent_scale": 0}, "'agent_scale'.*a number from 0.04 to 1.0"),
@@ -73,6 +83,10 @@ WRONG_MORTAR_MAYHEM = [
     ({"allowed_commands": 3}, "'allowed_commands'.*an integer from 4 to 9.*3"),
     ({"allowed_commands": 10}, "'allowed_commands'"),
     ({"allowed_commands": True}, "'allowed_commands'"),
+    ({"allowed_commands": 4.5}, "'allowed_commands'.*an integer from 4 to 9.*4.5"),
+    ({"allowed_commands": float("nan")}, "'allowed_commands'"),
+    ({"allowed_commands": float("inf")}, "'allowed_commands'"),
+    ({"explosion_delay": range(2)}, "'explosion_delay'"),
     ({"reward_command_success": float("inf")}, "'reward_command_success'.*a number from -1000000000 to 1000000000"),
     ({"reward_command_success": 1e308}, "'reward_command_success'"),
     ({"explosion_delay": [18] * 101}, "'explosion_delay'.*a list of 1 to 100 integers"),

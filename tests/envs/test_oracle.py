@@ -6,11 +6,12 @@ from itertools import pairwise
 import gymnasium as gym
 import numpy as np
 import pytest
-from players import FAMILY, player
+from helpers import FAMILY
 
 import memory_gym_envs
 from memory_gym_envs import MortarMayhem, MysteryPath
 from memory_gym_envs.mystery_path.state import EAST, NORTH, SOUTH, WEST
+from memory_gym_envs.players import player
 
 # Table 4.4, but for the act tasks: the thesis' formula says 18 to 234 and 6 to 78 there. The original itself, whose
 # first command has one step more than the others, needs one step more; behind a clue the reset makes up for it.
@@ -87,6 +88,7 @@ def test_failure_pays_only_the_failure_reward(env_id):
         assert info["commands_completed"] == (1.0 if done == 4 else done / 5)
         assert info["carried_out"] == done / 5
         assert info["success"] == (done == 4)
+        assert info["is_success"] is False
 
 
 @pytest.mark.parametrize("env_id", BOUNDS)
@@ -99,7 +101,7 @@ def test_failing_at_the_last_command(env_id):
     for seed in range(20):
         rewards, _, _, info = play_out(env, lambda: idle, seed, options)
         assert (info["success"], info["commands_completed"]) == (1, 1.0)
-        assert info["carried_out"] == (rewards[-1] == 3.1)
+        assert info["carried_out"] == info["is_success"] == (rewards[-1] == 3.1)
         assert not any(rewards[:-1])
         earned.add(rewards[-1])
     assert earned == {-0.5, 3.1}  # 3.1 where the command was to stay
@@ -217,7 +219,7 @@ def test_player_walks_the_path(env_id, seed):
     assert len(rewards) == info["length"] == (grid_arrival if "Grid" in env_id else arrival)(headings)
     assert [r for r in rewards if r] == [0.1] * (len(headings) - 1) + [goal]
     assert info["reward"] == pytest.approx(goal + 0.1 * (len(headings) - 1))
-    assert (info["success"], info["num_fails"]) == (1, 0)
+    assert (info["success"], info["is_success"], info["num_fails"]) == (1, True, 0)
 
 
 @pytest.mark.parametrize(("limit", "levels"), [(1, 3), (2, 3), (150, 3), (1500, 1)])

@@ -9,13 +9,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from helpers import EACH, check_same, roll
-from players import stumbling
 
 import fuzz_original
 from memory_gym_envs import IDS
 from memory_gym_envs.character import DIAGONAL_FORTH, PAD, SPAN, STRIDES, Figure, sprites, walk_table
 from memory_gym_envs.drawing import ring
 from memory_gym_envs.options import complete_options
+from memory_gym_envs.players import stumbling
 from memory_gym_envs.searing_spotlights.drawing import draw_coins_and_exits
 
 CROWD = {"spawn_interval": 1, "spot_min_speed": 1e-5, "spot_max_speed": 1e-4, "spot_damage": 0.0, "steps_per_coin": -1}
@@ -75,6 +75,26 @@ def test_a_crowd_of_spotlights_is_saved():
     roll(envs, 250)
     twin.set_state(envs.get_state())
     check_same(roll(envs, 20, seed=1), roll(twin, 20, seed=1))
+
+
+@pytest.mark.parametrize(("env_id", "steps", "other"), [
+    ("MortarMayhem-v0", 275, 93), ("MortarMayhem-Grid-v0", 119, 93), ("MortarMayhemB-v0", 235, 48),
+    ("MortarMayhemB-Grid-v0", 79, 48), ("Endless-MortarMayhem-v0", -1, 9), ("MysteryPath-v0", 512, 9),
+    ("MysteryPath-Grid-v0", 128, 9), ("Endless-MysteryPath-v0", -1, 9), ("SearingSpotlights-v0", 256, 9),
+    ("Endless-SearingSpotlights-v0", -1, 9),
+])  # fmt: skip
+def test_the_longest_episode(env_id, steps, other):
+    """As the original's attribute: of Mortar Mayhem by its options, one step too many where the clue is shown."""
+    env = gym.make(env_id).unwrapped
+    assert env.max_episode_steps == steps
+    options = {"max_steps": 9}
+    if other > 9:
+        options = {"command_count": [3, 5], "explosion_delay": [2, 7], "explosion_duration": [3, 1]}
+        options |= {} if "MayhemB" in env_id else {"command_show_duration": [2, 4], "command_show_delay": [1, 5]}
+    env.reset(seed=3, options=options)
+    assert env.max_episode_steps == other
+    env.reset()
+    assert env.max_episode_steps == steps
 
 
 def test_health_far_below_zero():

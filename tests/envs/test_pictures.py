@@ -4,7 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from helpers import EACH, MORTAR, SPOTLIGHTS, make, picture, roll
-from players import player
+
+from memory_gym_envs.players import player
 
 
 @EACH

@@ -10,7 +10,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from players import FAMILY
+from helpers import FAMILY
 
 import memory_gym_envs
 from memory_gym_envs import MortarMayhem, MysteryPath, SearingSpotlights

@@ -3,15 +3,17 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import HASTY, ONE_OBS, check_same
-from players import FAMILY
+from helpers import FAMILY, HASTY, ONE_OBS, check_same
 
 pytest.importorskip("stable_baselines3")
 
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
+from memory_gym_envs.players import player
 from memory_gym_envs.sb3 import SB3VecEnv
 
 LANES = 3
@@ -50,6 +52,41 @@ def test_as_its_own(env_id, obs_type):
 
 def as_dict(observations):
     return dict(observations) if isinstance(observations, dict) else observations
+
+
+class Kept(KVWriter):
+    """What was logged."""
+
+    def write(self, key_values, key_excluded, step=0):
+        self.values = dict(key_values)
+
+
+class Player:
+    """What EvalCallback needs of a model; it knows the way."""
+
+    def __init__(self, envs):
+        self.envs, self.logger, self.num_timesteps = envs, Logger(None, [Kept()]), 0
+
+    def predict(self, observations, **_):
+        return player(self.envs.venv.envs), None
+
+    def get_env(self):
+        return self.envs
+
+    def get_vec_normalize_env(self):
+        return None
+
+
+def test_the_rate_of_success_is_logged():
+    """Of episodes with a limit, which ends those with long paths."""
+    envs = VecMonitor(make("MysteryPath-Grid-v0", obs_type="vector", options={"max_steps": 11}))
+    envs.seed(0)
+    callback = EvalCallback(envs, n_eval_episodes=9, eval_freq=1, verbose=0)
+    callback.init_callback(Player(envs))
+    callback.on_step()
+    (kept,) = callback.logger.output_formats
+    assert 0 < kept.values["eval/success_rate"] < 1
+    assert kept.values["eval/success_rate"] == pytest.approx(kept.values["eval/mean_reward"])  # 1 for the goal, and for nothing else
 
 
 def test_a_limit_of_steps_is_a_truncation():

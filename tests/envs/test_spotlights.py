@@ -6,10 +6,10 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from players import player
 
 from memory_gym_envs.character import BODY, HAND_OUTLINE, PAD
 from memory_gym_envs.entries import vector_slices
+from memory_gym_envs.players import player
 from memory_gym_envs.searing_spotlights import VARIANTS
 from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, RADIUS, REACH, SIGHT, SPEED, START, TIME
 
@@ -214,13 +214,14 @@ def test_dying_at_the_exit_pays_but_is_no_success():
     while reward < 1.0:
         earlier = copy.deepcopy(env)
         _, reward, _, _, info = env.step(act())
-    assert info["success"] == 1
+    assert (info["success"], info["is_success"]) == (1, True)
     # The same step again, but with the last health lost in it.
     s = earlier.batch.state
     s.spots[[REACH, SIGHT], 0, 0], s.health[0] = 1e6, 1.0
     _, reward, terminated, _, info = earlier.step(player(earlier.batch)[0])
     assert terminated
     assert (reward, info["success"], info["coins_collected"], info["agent_health"]) == (0.5, 0, 1.0, 0.0)
+    assert info["is_success"] is False
 
 
 def test_bar_shows_the_action_and_the_reward_before_the_last():

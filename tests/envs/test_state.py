@@ -6,8 +6,9 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import EACH, EACH_OBS, HASTY, ONE_OBS, check_same, make, roll
-from players import FAMILY, choices
+from helpers import EACH, EACH_OBS, FAMILY, HASTY, ONE_OBS, check_same, make, roll
+
+from memory_gym_envs.players import choices
 
 
 @ONE_OBS

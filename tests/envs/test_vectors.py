@@ -8,8 +8,7 @@ from collections import defaultdict
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import EACH, MORTAR, check_same
-from players import FAMILY, player, spot_player, stumbling
+from helpers import EACH, FAMILY, MORTAR, check_same
 
 from memory_gym_envs import IDS, MortarMayhem, MysteryPath, SearingSpotlights
 from memory_gym_envs.base import ALL
@@ -19,6 +18,7 @@ from memory_gym_envs.mortar_mayhem.arena import COMMANDS
 from memory_gym_envs.mortar_mayhem.drawing import SYMBOL, SYMBOL_AT
 from memory_gym_envs.mystery_path.options import SIDE
 from memory_gym_envs.mystery_path.state import PIT_ROWS, ROWS
+from memory_gym_envs.players import player, spot_player, stumbling
 from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT
 
 LANES, STEPS = 48, 80

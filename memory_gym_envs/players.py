@@ -1,25 +1,35 @@
-"""Scripted players that see the state, for tests: they know the target and walk to it."""
+"""Scripted players that see the whole state: they know the target and walk to it.
+
+    from memory_gym_envs import players
+
+    observations, rewards, terminations, truncations, infos = envs.step(players.player(envs))
+
+For data to imitate, and to know what a task's best possible score is. In Searing Spotlights the player goes straight
+through the light; where the path of Endless Mystery Path goes left, it stops, since nobody can follow it.
+"""
+
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-import memory_gym_envs
-from memory_gym_envs import MysteryPath, SearingSpotlights
+from memory_gym_envs.base import MemoryGymVectorEnv
+from memory_gym_envs.mystery_path import MysteryPath
 from memory_gym_envs.mystery_path.drawing import tile_centres
 from memory_gym_envs.mystery_path.state import EAST, WEST
+from memory_gym_envs.searing_spotlights import SearingSpotlights
 from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE
 
 TILE, SCREEN = 14, 84
-FAMILY = {env_id: family for family in memory_gym_envs.FAMILIES for env_id in family.variants}
 
 
-def choices(env) -> int:
+def choices(env: Any) -> int:
     """How many values an action, or each part of one, has."""
     space = getattr(env, "single_action_space", env.action_space)
     return int(space.nvec[0]) if isinstance(space, gym.spaces.MultiDiscrete) else int(space.n)
 
 
-def free_player(batch) -> np.ndarray:
+def free_player(batch: Any) -> np.ndarray:
     """(N, 2) actions towards the middle of each lane's target tile, on a torus the short way."""
     s = batch.state
     away = s.target_corner + TILE // 2 - s.pos  # (N, 2)
@@ -28,7 +38,7 @@ def free_player(batch) -> np.ndarray:
     return np.where(away > 2, 2, np.where(away < -2, 1, 0))
 
 
-def grid_player(batch) -> np.ndarray:
+def grid_player(batch: Any) -> np.ndarray:
     """(N,) actions: turn the short way towards the target, first along x, then walk."""
     s = batch.state
     away = (s.target_corner + TILE // 2 - s.pos) // TILE  # (N, 2) tiles
@@ -42,14 +52,14 @@ def turn_or_walk(facing: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.where(facing == wanted, 3, np.where((wanted - facing) % 8 > 4, 2, 1))
 
 
-def path_grid_player(batch) -> np.ndarray:
+def path_grid_player(batch: Any) -> np.ndarray:
     """(N,) actions to the path's next tile."""
     s = batch.state
     heading = s.direction_at[np.arange(batch.num_envs), s.last_path_step]
     return turn_or_walk(s.facing, np.array([6, 0, 4, 2])[heading])
 
 
-def path_free_player(batch) -> np.ndarray:
+def path_free_player(batch: Any) -> np.ndarray:
     """(N, 2) actions to the path's next tile: first to the middle of the way there, then along it."""
     s, lanes = batch.state, np.arange(batch.num_envs)
     away = tile_centres(s.path_cell[lanes, np.minimum(s.last_path_step + 1, s.path_length)]) - s.pos  # (N, 2)
@@ -59,13 +69,13 @@ def path_free_player(batch) -> np.ndarray:
     return both * np.stack([along_x != aside, along_x == aside], axis=1)
 
 
-def path_endless_player(batch) -> np.ndarray:
+def path_endless_player(batch: Any) -> np.ndarray:
     """(N,) actions likewise. Where the path goes left, nothing."""
     across, down = path_free_player(batch).T
     return np.where(across == 2, 1, np.where(down > 0, down + 1, 0))
 
 
-def spot_player(batch) -> np.ndarray:
+def spot_player(batch: Any) -> np.ndarray:
     """(N, 2) actions straight to the first coin left, then to the exit, whatever the spotlights do."""
     bodies = batch.state.bodies  # (2, N, B)
     order = np.concatenate([bodies[:, :, COIN:], bodies[:, :, [EXIT, AGENT]]], axis=2)
@@ -74,17 +84,20 @@ def spot_player(batch) -> np.ndarray:
     return np.where(away > 1, 2, np.where(away < -1, 1, 0))
 
 
-def player(batch) -> np.ndarray:
-    """The right player for the batch."""
-    if isinstance(batch, SearingSpotlights):
-        return spot_player(batch)
-    if isinstance(batch, MysteryPath) and batch.variant.endless:
-        return path_endless_player(batch)
-    free, grid = (path_free_player, path_grid_player) if isinstance(batch, MysteryPath) else (free_player, grid_player)
-    return grid(batch) if batch.variant.grid else free(batch)
+def player(envs: MemoryGymVectorEnv) -> np.ndarray:
+    """The actions, (N,) or (N, 2), of the player that knows the task of these environments.
+
+    For one environment made by gym.make(id), env.step(player(env.unwrapped.batch)[0]).
+    """
+    if isinstance(envs, SearingSpotlights):
+        return spot_player(envs)
+    if isinstance(envs, MysteryPath) and envs.variant.endless:
+        return path_endless_player(envs)
+    free, grid = (path_free_player, path_grid_player) if isinstance(envs, MysteryPath) else (free_player, grid_player)
+    return grid(envs) if envs.variant.grid else free(envs)
 
 
-def stumbling(batch, rng: np.random.Generator, chance: np.ndarray) -> np.ndarray:
+def stumbling(batch: Any, rng: np.random.Generator, chance: np.ndarray) -> np.ndarray:
     """The player's actions, each lane's replaced by random ones with its chance (N,)."""
     actions = player(batch)
     stumble = rng.random(batch.num_envs) < chance
