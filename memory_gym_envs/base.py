@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.spaces import Discrete, MultiDiscrete
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -27,6 +28,7 @@ from memory_gym_envs.variant import Variant
 
 RENDER_MODES = ("rgb_array", "debug_rgb_array")
 OBS_TYPES = ("pixels", "grayscale", "vector")
+ACTION_TYPES = ("native", "discrete")
 DEBUG_ZOOM = 4  # the debug view is 336 x 336
 ALL = slice(None)  # every lane
 NO_LIMIT = np.iinfo(np.int64).max  # of steps
@@ -56,6 +58,8 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         obs_type: "pixels" (the id's own observation space), "grayscale" (the same with pictures of one channel, their
             luminance) or "vector": a flat (V,) float32 vector of what the frame shows, and of nothing that it hides; no
             frame is drawn then. `variant.entries` says what is in it.
+        action_type: "native" (the id's own action space) or "discrete": one number of nine where the id has two of
+            three, 3 times the first plus the second.
         options: reset parameters that are this environment's defaults, for resets that do not give them.
         autoreset_mode: when an episode that ends is reset: in the same step, in the next one, or by the caller.
         max_episode_steps: truncates longer episodes, as `gym.make(id, max_episode_steps=...)` does.
@@ -93,6 +97,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         options: Mapping[str, Any] | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         max_episode_steps: int | None = None,
+        action_type: str = "native",
     ):
         missing = [name for name in OF_A_FAMILY if getattr(type(self), name) is getattr(MemoryGymVectorEnv, name)]
         if missing:
@@ -103,6 +108,8 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             raise ValueError(f"render_mode must be None, {' or '.join(map(repr, RENDER_MODES))}, not {render_mode!r}")
         if obs_type not in OBS_TYPES:
             raise ValueError(f"obs_type must be one of {', '.join(map(repr, OBS_TYPES))}, not {obs_type!r}")
+        if action_type not in ACTION_TYPES:
+            raise ValueError(f"action_type must be {' or '.join(map(repr, ACTION_TYPES))}, not {action_type!r}")
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -123,6 +130,10 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             self.single_observation_space = vector_space(self.variant.entries)
         elif obs_type == "grayscale":
             self.single_observation_space = grayscale_space(self.single_observation_space)
+        self.joined: tuple[int, ...] | None = None  # the sizes of the branches that one number stands for
+        if action_type == "discrete" and isinstance(self.single_action_space, MultiDiscrete):
+            self.joined = tuple(self.single_action_space.nvec.tolist())
+            self.single_action_space = Discrete(math.prod(self.joined))
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._action_shape = (self.num_envs, *(self.single_action_space.shape or ()))
@@ -137,6 +148,8 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         self.arguments = {"id": variant, **{name: getattr(self, name) for name in names}}
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             self.arguments["autoreset_mode"] = self.autoreset_mode.value
+        if self.joined:
+            self.arguments["action_type"] = action_type
         self.ready = False
         self._over = np.zeros(self.num_envs, bool)  # lanes that wait for a reset; in the same-step mode, none does
         self.allocate()
@@ -395,13 +408,13 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             self._rngs[lane], self._seeds[lane] = seeding.np_random(seed)
 
     def checked_actions(self, actions: Any) -> np.ndarray:
-        """The actions as int64, or a ValueError that says what they must be."""
+        """The id's own actions as int64, (N,) or (N, 2), or a ValueError that says what `actions` must be."""
         array = _array(actions)
         if array.shape == self._action_shape and array.dtype.kind in "iu":
             array = array.astype(np.int64, copy=False)
             # Negative numbers are huge as unsigned ones, so one comparison checks both ends.
             if not np.count_nonzero(array.view(np.uint64) >= self._choices):
-                return array
+                return np.stack(np.unravel_index(array, self.joined), axis=1) if self.joined else array
         highest = " or ".join(map(str, np.unique(self._choices).astype(int) - 1))
         limit = f"integers from 0 to {highest} of shape {self._action_shape}"
         raise ValueError(f"{self.variant_id}: actions must be {limit}, not {brief(actions)}")

@@ -90,11 +90,13 @@ def player(envs: MemoryGymVectorEnv) -> np.ndarray:
     For one environment made by gym.make(id), env.step(player(env.unwrapped.batch)[0]).
     """
     if isinstance(envs, SearingSpotlights):
-        return spot_player(envs)
-    if isinstance(envs, MysteryPath) and envs.variant.endless:
-        return path_endless_player(envs)
-    free, grid = (path_free_player, path_grid_player) if isinstance(envs, MysteryPath) else (free_player, grid_player)
-    return grid(envs) if envs.variant.grid else free(envs)
+        actions = spot_player(envs)
+    elif isinstance(envs, MysteryPath):
+        endless, grid = envs.variant.endless, envs.variant.grid
+        actions = (path_endless_player if endless else path_grid_player if grid else path_free_player)(envs)
+    else:
+        actions = (grid_player if envs.variant.grid else free_player)(envs)
+    return np.ravel_multi_index(actions.T, envs.joined) if envs.joined else actions
 
 
 def stumbling(batch: Any, rng: np.random.Generator, chance: np.ndarray) -> np.ndarray:

@@ -32,10 +32,13 @@ class MemoryGymEnv(gym.Env):
         start_level: int = 0,
         obs_type: str = "pixels",
         options: Mapping[str, Any] | None = None,
+        action_type: str = "native",
     ):
         if not hasattr(self, "family"):
             raise TypeError(f"gym.make(id) makes an environment: {type(self).__name__} lacks family")
-        self.batch = self.family(variant, 1, render_mode, num_levels, start_level, obs_type, options)
+        self.batch = self.family(
+            variant, 1, render_mode, num_levels, start_level, obs_type, options, action_type=action_type
+        )
         self.render_mode = render_mode
         self.metadata = {**type(self).metadata, "render_fps": self.batch.metadata["render_fps"]}
         self.observation_space = self.batch.single_observation_space

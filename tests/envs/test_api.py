@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 from helpers import EACH, EACH_OBS, FAMILIES, FAMILY, HASTY, LANES, check_same, make, picture, roll
 
 import memory_gym_envs
+from memory_gym_envs.players import player
 
 
 @EACH_OBS
@@ -108,6 +109,26 @@ def test_ids():
     assert all(env_id in gym.registry for env_id in memory_gym_envs.IDS)
 
 
+@EACH
+def test_two_branches_as_one_number(env_id):
+    """Nine actions, all of which are played; ids with one branch keep theirs."""
+    two, one = make(env_id, obs_type="vector"), make(env_id, obs_type="vector", action_type="discrete")
+    assert one.single_action_space == gym.make(env_id, action_type="discrete").action_space
+    if isinstance(two.single_action_space, gym.spaces.Discrete):
+        assert (one.action_space, one.arguments) == (two.action_space, two.arguments)
+        return
+    assert one.single_action_space == gym.spaces.Discrete(9)
+    check_same(two.reset(seed=3), one.reset(seed=3))
+    for step in range(36):
+        actions = np.array([divmod((step + lane) % 9, 3) for lane in range(LANES)])
+        check_same(two.step(actions), one.step(actions @ [3, 1]))
+        check_same(player(two) @ [3, 1], player(one))
+    with pytest.raises(ValueError, match=r"integers from 0 to 8 of shape \(4,\)"):
+        one.step(actions)
+    with pytest.raises(ValueError, match="action_type"):
+        two.set_state(one.get_state())
+
+
 # ---- wrong arguments and actions ----
 
 
@@ -117,6 +138,7 @@ def test_ids():
     [
         ({"render_mode": "ansi"}, "render_mode"),
         ({"obs_type": "pixel"}, "obs_type"),
+        ({"action_type": "multi"}, "action_type must be 'native' or 'discrete', not 'multi'"),
         ({"num_levels": -1}, "num_levels"),
         ({"num_levels": 1.5}, "num_levels"),
         ({"num_levels": False}, "num_levels"),

@@ -57,7 +57,7 @@ def test_docstring_and_signature(env_id):
         assert "## Version History\n" in text
         assert "| 0 " in text
     names = [*inspect.signature(type(env)).parameters]
-    assert names == ["variant", "render_mode", "num_levels", "start_level", "obs_type", "options"]
+    assert names == ["variant", "render_mode", "num_levels", "start_level", "obs_type", "options", "action_type"]
 
 
 EVERYTHING = "variants, spaces, allocate, begin, advance, vectors, frames, ground_truth, summary"

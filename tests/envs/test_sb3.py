@@ -86,7 +86,8 @@ def test_the_rate_of_success_is_logged():
     callback.on_step()
     (kept,) = callback.logger.output_formats
     assert 0 < kept.values["eval/success_rate"] < 1
-    assert kept.values["eval/success_rate"] == pytest.approx(kept.values["eval/mean_reward"])  # 1 for the goal, and for nothing else
+    # A reward of 1 for the goal, and for nothing else.
+    assert kept.values["eval/success_rate"] == pytest.approx(kept.values["eval/mean_reward"])
 
 
 def test_a_limit_of_steps_is_a_truncation():
