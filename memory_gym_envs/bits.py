@@ -133,9 +133,17 @@ def pixels(masks: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
     return _pixels().take(masks, out=out, mode="clip").view(np.uint8)
 
 
+def bit_counts(numbers: np.ndarray) -> np.ndarray:
+    """How many bits of each number are set, (..., k) unsigned, contiguous: (..., k) uint8."""
+    if hasattr(np, "bitwise_count"):  # since NumPy 2
+        return np.bitwise_count(numbers)
+    of_bytes = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint8)
+    return of_bytes[numbers.view(np.uint8)].reshape(*numbers.shape, numbers.itemsize).sum(axis=-1, dtype=np.uint8)
+
+
 def tile_counts(lines: np.ndarray) -> np.ndarray:
     """Bits of samples, (n, 42) uint64, in each tile of 12 x 12 pixels, at most 48: (n, 49) uint8."""
-    counts = np.bitwise_count(lines.view(np.uint8)).view(np.uint64).reshape(len(lines), TILES, -1)
+    counts = bit_counts(lines.view(np.uint8)).view(np.uint64).reshape(len(lines), TILES, -1)
     sums_ = np.einsum("njr->nj", counts).view(np.uint8).reshape(len(lines), TILES, 8)
     return sums_[..., :TILES].reshape(len(lines), -1)
 
@@ -159,5 +167,5 @@ _MOMENTS = _MOMENTS.reshape(-1, 3)
 
 def sums(lines: np.ndarray) -> np.ndarray:
     """How many bits of samples, (n, 42) uint64, are set, and the sums of their pixels' x and y: (n, 3) float32."""
-    counts = np.bitwise_count(lines[:, None] & _PLANES)  # (n, 8, 42)
+    counts = bit_counts(lines[:, None] & _PLANES)  # (n, 8, 42)
     return counts.reshape(len(lines), len(_MOMENTS)).astype(np.float32) @ _MOMENTS

@@ -45,7 +45,7 @@ from memory_gym_envs.variant import Variant
 FAINT = 252  # the highest opacity at which an agent, (3, 3, 2) then, still differs from white floor
 SLIGHT = 5  # the highest opacity that may leave some colours as they are
 FIRST_RIM = 51  # the lowest opacity at which a rim differs from all colours under it, if only by 1
-ROWS_BELOW = np.where(np.arange(0, SCREEN, SAMPLE_STEP) < TOP_BAR, 0, FULL_ROW).astype(np.uint64)  # (42,) below the bar
+ROWS_BELOW = np.where(np.arange(0, SCREEN, SAMPLE_STEP) < TOP_BAR, np.uint64(0), FULL_ROW)  # (42,) below the bar
 TILE_SHARE = 1 / tile_counts(ROWS_BELOW[None]).astype(np.float32)  # (1, 49)
 FULL_SHARE = TILE_SHARE.min()  # of a tile beside the bar
 BLUE_SAMPLE = sample((floors()[BLUE_FLOOR].reshape(SCREEN, SCREEN, 3) == BLUE).all(axis=-1))  # (42,) or the red tiles

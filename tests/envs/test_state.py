@@ -204,7 +204,7 @@ PCG = np.random.PCG64(0).state
         ({**PCG, "bit_generator": "PCG65"}, "a generator of an unknown kind, 'PCG65'"),
         ({"bit_generator": "PCG64"}, "a generator that is no PCG64: KeyError"),
         ({**PCG, "state": None}, "a generator that is no PCG64: TypeError"),
-        ({**PCG, "state": {"state": -1, "inc": 1}}, "a generator that is no PCG64: OverflowError"),
+        ({**PCG, "state": {"state": 2**200, "inc": 1}}, "a generator that is no PCG64: OverflowError"),
         ({**PCG, "bit_generator": "SFC64"}, "a generator that is no SFC64: "),
         ({"bit_generator": "MT19937", "state": {"key": [1], "pos": 0}}, "a generator that is no MT19937: IndexError"),
     ],

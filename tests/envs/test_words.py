@@ -1,9 +1,11 @@
-"""Words of a bit generator make the numbers that NumPy's generator would draw, and leave it in the same state."""
+"""Words of a bit generator make the numbers that NumPy's generator would draw; bits are counted in every NumPy."""
 
 import numpy as np
 import pytest
+from helpers import check_same
 from numpy.random import MT19937, PCG64, PCG64DXSM, SFC64, Generator, Philox
 
+from memory_gym_envs.bits import bit_counts
 from memory_gym_envs.words import LOW, PERCENT_AGAIN, WordBuffer, below, words
 
 LIMITS = [
@@ -106,3 +108,12 @@ def test_picks_draw_again():
 def test_a_tape_needs_64_bit_numbers():
     with pytest.raises(ValueError, match="MT19937"):
         WordBuffer(Generator(MT19937(0)), 4)
+
+
+@pytest.mark.parametrize("shape", [(0, 42), (3, 8, 42)])
+@pytest.mark.parametrize("kind", [np.uint8, np.uint64])
+def test_bits_are_counted_alike_in_older_versions_of_numpy(shape, kind, monkeypatch):
+    numbers = np.random.default_rng(0).integers(0, np.iinfo(kind).max, shape, kind, endpoint=True)
+    wanted = np.bitwise_count(numbers)
+    monkeypatch.delattr(np, "bitwise_count")
+    check_same(bit_counts(numbers), wanted)
