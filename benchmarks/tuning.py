@@ -22,7 +22,6 @@ import tyro
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
 
 import learning
-import tables
 from ppo_utils.run_logs import align, read_run
 from suites import LAPTOP, TASKS
 
@@ -80,13 +79,13 @@ def steps_to(goal: float, steps: np.ndarray, scores: np.ndarray) -> str:
 
 
 def table(speeds: dict[tuple[str, str], float]) -> str:
-    """Return a row for each task and script: score, steps to 0.5 and 0.9 of the best, and speed.
+    """Return a row for each task: the steps of a training, and each agent's to 0.5 and 0.9 of the best, and speed.
 
     The best is the best possible score, or where there is no bound the highest mean of these agents. Raises SystemExit
     where an agent has no results.
     """
-    lines = ["| task | script | steps | score | steps to 0.5 | to 0.9 | steps/s |"]
-    lines.append("|---|---|---:|---:|---:|---:|---:|")
+    lines = ["| task | steps | transformer: to 0.5 | to 0.9 | steps/s | GRU: to 0.5 | to 0.9 | steps/s |"]
+    lines.append("|---|---:|---:|---:|---:|---:|---:|---:|")
     for name in dict.fromkeys(task for task, _ in speeds):
         runs_of = {
             script: learning.results_of(learning.Config(results=RESULTS), plans_of(name, agent))[name].popitem()[1]
@@ -97,11 +96,11 @@ def table(speeds: dict[tuple[str, str], float]) -> str:
         task = TASKS[name]
         curves = {script: align([run.curves[f"eval/{task.score}"] for run in runs]) for script, runs in runs_of.items()}
         best = task.best_score or max(scores[-1].mean() for _, scores in curves.values())
+        total = int(next(iter(runs_of.values()))[0].args["total_timesteps"])
+        cells = [name, f"{total / 1e6:g} M"]
         for script, (steps, scores) in curves.items():
-            total = int(runs_of[script][0].args["total_timesteps"])
-            cells = [name, f"`{script}`", f"{total / 1e6:g} M", tables.mean_and_error(scores[-1])]
-            cells += [steps_to(share * best, steps, scores) for share in (0.5, 0.9)]
-            lines.append(f"| {' | '.join([*cells, f'{speeds[name, script]:,.0f}'])} |")
+            cells += [steps_to(share * best, steps, scores) for share in (0.5, 0.9)] + [f"{speeds[name, script]:,.0f}"]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

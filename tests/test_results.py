@@ -8,10 +8,13 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tyro
+from PIL import Image
 
 import claims
+import frontier
 import learning
 import tables
 import tuning
@@ -58,6 +61,19 @@ def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_pa
 def test_the_table_of_minutes_is_printed_by_its_command(capsys):
     tuning.main(tuning.Config())
     assert capsys.readouterr().out in (ROOT / "docs/tuning.md").read_text()
+
+
+def test_the_frontier_is_printed_and_drawn(capsys, tmp_path):
+    frontier.main(tmp_path / "frontier.png")
+    assert capsys.readouterr().out in (ROOT / "docs/tuning.md").read_text()
+    made, shown = (Image.open(folder / "frontier.png").size for folder in (tmp_path, ROOT / "docs"))
+    assert made == shown
+
+
+def test_who_has_learned_a_command():
+    """Nine of ten who come to it, and to all before it."""
+    steps, episodes = np.array([1e6, 2e6]), np.array([[100, 90, 80, 72], [100, 95, 90, 0]])
+    assert [frontier.first_time(steps, episodes, count) for count in (1, 2, 3)] == ["1.00", "2.00", ""]
 
 
 def test_the_page_ends_with_the_tables_of_the_results_that_are_there(capsys):
