@@ -1,12 +1,16 @@
 """Stable-Baselines3 gets the same from N lanes as from N single environments in its own DummyVecEnv."""
 
+import re
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from helpers import FAMILY, HASTY, ONE_OBS, check_same
 
-pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
 
+import sb3_contrib
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import KVWriter, Logger
@@ -52,6 +56,22 @@ def test_as_its_own(env_id, obs_type):
 
 def as_dict(observations):
     return dict(observations) if isinstance(observations, dict) else observations
+
+
+def test_the_page_s_training(monkeypatch):
+    """A rollout of it; all else as it stands there."""
+    made = []
+
+    class Short(sb3_contrib.RecurrentPPO):
+        def __init__(self, *args):
+            super().__init__(*args, n_steps=8, n_epochs=1, device="cpu")
+            made.append(self)
+
+    monkeypatch.setattr(sb3_contrib, "RecurrentPPO", Short)
+    page = (Path(__file__).parents[2] / "docs/environments.md").read_text()
+    (block,) = (each for each in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "SB3VecEnv" in each)
+    exec(block.replace("100_000", "1"), {})
+    assert made[0].num_timesteps == 8 * 16
 
 
 class Kept(KVWriter):
