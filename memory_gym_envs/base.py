@@ -198,6 +198,18 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         """The lanes' ended episodes in numbers, each (n,): the final info but for the ground truth."""
         raise NotImplementedError
 
+    def oracle(self) -> dict[str, np.ndarray]:
+        """The whole task in plain numbers, (N, ...) fresh arrays, hidden or not: for players, probes and displays.
+
+        Here what all families have: `length`, steps so far, and `seed`, what the lane's generator was last seeded with
+        (-1: not known), which is the level, unless an episode began since without a seed and `num_levels`. Raises
+        Gymnasium's ResetNeeded before the first reset.
+        """
+        if not self.ready:
+            raise gym.error.ResetNeeded("call reset() before oracle()")
+        seeds = [-1 if seed is None else seed for seed in self._seeds]
+        return {"seed": np.array(seeds), "length": self.state.length.copy()}
+
     def longest_episode(self, lane: int) -> int:
         """The steps after which the lane's episode is over at the latest, under its reset options; -1: no limit."""
         return self.settings[lane]["max_steps"]

@@ -105,6 +105,12 @@ class MemoryGymEnv(gym.Env):
         """The reset options of an episode that is started without any."""
         return dict(self.batch.defaults)
 
+    def oracle(self) -> dict[str, Any]:
+        """The whole task in plain numbers and arrays, hidden or not, as the family's `oracle` names them."""
+        return {
+            name: values[0].item() if values.ndim == 1 else values[0] for name, values in self.batch.oracle().items()
+        }
+
     @property
     def max_episode_steps(self) -> int:
         """The steps after which this episode is over at the latest; -1: no limit. Known before the first reset too."""

@@ -9,7 +9,17 @@ import gymnasium as gym
 import numpy as np
 
 from memory_gym_envs.base import MemoryGymVectorEnv, limit_of, numbered
-from memory_gym_envs.character import SPAN, STRIDES, Figure, agent_tables, free_controls, grid_controls, radius_of, walk
+from memory_gym_envs.character import (
+    PAD,
+    SPAN,
+    STRIDES,
+    Figure,
+    agent_tables,
+    free_controls,
+    grid_controls,
+    radius_of,
+    walk,
+)
 from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.mortar_mayhem.arena import COMMANDS, FLOORS, TILE, TORUS_SIZE, first_pixel
 from memory_gym_envs.mortar_mayhem.drawing import circle_target, draw
@@ -294,6 +304,21 @@ class MortarMayhem(MemoryGymVectorEnv):
         numbers |= {"success": success.astype(np.int64), "commands_completed": share}
         carried_out = s.completed[lanes] / s.count[lanes]
         return numbers | {"carried_out": carried_out, "is_success": carried_out == 1}
+
+    def oracle(self) -> dict[str, np.ndarray]:
+        """The whole task in plain numbers, (N, ...): besides `seed` and `length`,
+
+        `position` (N, 2), the agent's centre in pixels, x and y; `tile` and `target_tile` (N, 2), column and row of its
+        tile and of the one that the command leads to; `command` (N,), its index in COMMANDS; `commands_left` (N,), in
+        this round, with the present one; `carried_out` (N,), in this episode.
+        """
+        s = self.state
+        position, side = s.pos - PAD, s.size[:, None]
+        target = np.rint(s.truth * (side - 1)).astype(np.int64)
+        present = s.commands[np.arange(self.num_envs), np.minimum(s.current, s.count - 1)]
+        numbers = {"position": position, "tile": (position - first_pixel(side)) // TILE, "target_tile": target}
+        counts = {"commands_left": s.count - s.current, "carried_out": s.completed.copy()}
+        return super().oracle() | numbers | {"command": present} | counts
 
     def longest_episode(self, lane: int) -> int:
         """The steps after which the lane's episode is over at the latest, under its reset options; -1: no limit."""

@@ -25,7 +25,7 @@ from memory_gym_envs.drawing import (
     stamp,
 )
 from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE
-from memory_gym_envs.mystery_path.state import NO_CELL, PIT_ROWS, ROWS, State
+from memory_gym_envs.mystery_path.state import NO_CELL, ROWS, State, tiles_of
 
 GREY, ICE = (210, 210, 210), (125, 177, 250)
 CROSS = 10  # width of the cross
@@ -110,7 +110,7 @@ def place_on_screen(s: State, lanes: np.ndarray | slice, endless: bool) -> np.nd
 
 def tile_centres(cell: np.ndarray) -> np.ndarray:
     """(n, 2) the centres of the cells' tiles, with PAD."""
-    return np.stack([cell // ROWS, cell % ROWS - PIT_ROWS], axis=1) * TILE + TILE // 2 + PAD
+    return tiles_of(cell) * TILE + TILE // 2 + PAD
 
 
 def trail_on_screen(s: State, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

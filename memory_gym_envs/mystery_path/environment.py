@@ -31,7 +31,17 @@ from memory_gym_envs.mystery_path.rules import (
     spend_stamina,
     walk_endless,
 )
-from memory_gym_envs.mystery_path.state import FAST, MAP_STRIDES, NO_CELL, PIT, PIT_ROWS, ROWS, State, make_path_room
+from memory_gym_envs.mystery_path.state import (
+    FAST,
+    MAP_STRIDES,
+    NO_CELL,
+    PIT,
+    PIT_ROWS,
+    ROWS,
+    State,
+    make_path_room,
+    tiles_of,
+)
 from memory_gym_envs.mystery_path.vectors import ViewOptions, make_vector_tables, make_vectors
 from memory_gym_envs.state import empty
 
@@ -290,6 +300,23 @@ class MysteryPath(MemoryGymVectorEnv):
             return numbers | {"num_fails": s.fails[lanes]} | places
         success = s.path_step[lanes] == s.path_length[lanes]
         return numbers | {"success": success.astype(np.int64), "num_fails": s.fails[lanes], "is_success": success}
+
+    def oracle(self) -> dict[str, np.ndarray]:
+        """The whole task in plain numbers, (N, ...): besides `seed` and `length`,
+
+        `position` (N, 2), the agent's centre in pixels, x and y; `tile` (N, 2), its column and row; `next_tile` (N, 2),
+        the path's next one from where the agent last was on it; `falls` (N,); in the finite ids `goal_tile` (N, 2) and
+        `tiles_left` (N,), how many follow on the path. In the endless id, columns and x are counted along the path.
+        """
+        s, lanes = self.state, np.arange(self.num_envs)
+        step = np.maximum(s.last_path_step, 1)
+        following = s.path_cell[lanes, np.minimum(step + 1, s.path_length)]
+        numbers = {"position": s.pos - PAD, "tile": s.tile.copy(), "next_tile": tiles_of(following)}
+        numbers["falls"] = s.fails.copy()
+        if not self.variant.endless:
+            numbers["goal_tile"] = tiles_of(s.path_cell[lanes, s.path_length])
+            numbers["tiles_left"] = s.path_length - step
+        return super().oracle() | numbers
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Draws the path in white, its origin and transition tiles blue, its goal green, walls red, then the agent."""

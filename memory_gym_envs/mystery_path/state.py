@@ -30,6 +30,11 @@ DIRECTIONS = np.zeros(2 * ROWS + 1, np.int64)  # by the difference of two cells;
 DIRECTIONS[[ROWS, -1, 1, -ROWS]] = EAST, NORTH, SOUTH, WEST
 
 
+def tiles_of(cell: np.ndarray) -> np.ndarray:
+    """(n, 2) the cells' columns and rows."""
+    return np.stack([cell // ROWS, cell % ROWS - PIT_ROWS], axis=1)
+
+
 @dataclass
 class State:
     """The lanes' state. Positions are pixels with PAD added, tiles count from the top left."""

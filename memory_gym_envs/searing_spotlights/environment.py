@@ -34,7 +34,7 @@ from memory_gym_envs.searing_spotlights.rules import (
     take_coins,
     touched_bodies,
 )
-from memory_gym_envs.searing_spotlights.state import AGENT, COIN, RADIUS, State
+from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, RADIUS, State
 from memory_gym_envs.searing_spotlights.vectors import make_vectors, vector_tables
 from memory_gym_envs.state import empty, make_room
 from memory_gym_envs.words import words
@@ -298,6 +298,22 @@ class SearingSpotlights(MemoryGymVectorEnv):
         share = np.where(coins > 0, s.collected[lanes] / np.maximum(coins, 1), 1.0)
         success = s.success[lanes]
         return numbers | {"coins_collected": share, "success": success, "is_success": success == 1}
+
+    def oracle(self) -> dict[str, np.ndarray]:
+        """The whole task in plain numbers, (N, ...): besides `seed` and `length`,
+
+        `position` (N, 2), the agent's centre in pixels, x and y; `coins` (N, C, 2), the coins', NaN where one is gone;
+        `coins_left` and `coins_collected` (N,); `health` (N,); in the finite id `exit` (N, 2), NaN where there is none,
+        and `exit_is_open` (N,) bool.
+        """
+        s = self.state
+        places = np.where(s.bodies == GONE, np.nan, s.bodies).transpose(1, 2, 0)  # (N, B, 2)
+        numbers = {"position": s.bodies[:, :, AGENT].T.copy(), "coins": places[:, COIN:]}
+        numbers |= {"coins_left": s.coins_left.copy(), "coins_collected": s.collected.copy()}
+        numbers["health"] = s.health.copy()
+        if not self.variant.endless:
+            numbers |= {"exit": places[:, EXIT], "exit_is_open": s.is_open == 1}
+        return super().oracle() | numbers
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Lights everything below the bar, and circles the spotlights."""
