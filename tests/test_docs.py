@@ -270,7 +270,7 @@ def test_readme_names_the_memory_interface(script):
 def test_page_names_the_curves(tiny, scalars):
     page = (ROOT / "docs/logging.md").read_text()
     rows = re.findall(r"^\| (`\w+/.+?) \|", page, re.MULTILINE)
-    changes = {"env_id": "MortarMayhemB-Grid-v0", "total_timesteps": 256, "eval_interval": 4, "eval_levels": 2}
+    changes = {"env_id": "MortarMayhemB-Grid-v0", "total_timesteps": 128, "eval_interval": 2, "eval_levels": 1}
     changes |= {"reconstruction_coef": 0.1, "ground_truth_coef": 0.1}
     logged = set()
     for script in SCRIPTS:

@@ -475,8 +475,8 @@ def marks_in(path):
 
 @pytest.mark.parametrize("first", [1, 4, 8])
 def test_every_step_is_in_the_video_once_and_in_order(first, tmp_path):
-    """36 lengths, each with another of the frame rates from 1 to 60."""
-    for length in range(first, 131, 11):
+    """18 lengths, each with another of the frame rates from 1 to 60."""
+    for length in range(first, 131, 22):
         fps = 1 + 7 * length % 60
         path, writer = tmp_path / "some.mp4", None
         writer = video_writer(path, (16, 128, 3), fps)
