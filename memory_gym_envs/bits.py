@@ -133,12 +133,14 @@ def pixels(masks: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
     return _pixels().take(masks, out=out, mode="clip").view(np.uint8)
 
 
+_BITS_OF_BYTES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint8)  # (256,)
+
+
 def bit_counts(numbers: np.ndarray) -> np.ndarray:
     """How many bits of each number are set, (..., k) unsigned, contiguous: (..., k) uint8."""
     if hasattr(np, "bitwise_count"):  # since NumPy 2
         return np.bitwise_count(numbers)
-    of_bytes = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint8)
-    return of_bytes[numbers.view(np.uint8)].reshape(*numbers.shape, numbers.itemsize).sum(axis=-1, dtype=np.uint8)
+    return _BITS_OF_BYTES[numbers.view(np.uint8)].reshape(*numbers.shape, numbers.itemsize).sum(axis=-1, dtype=np.uint8)
 
 
 def tile_counts(lines: np.ndarray) -> np.ndarray:

@@ -4,8 +4,8 @@
 
     observations, rewards, terminations, truncations, infos = envs.step(players.player(envs))
 
-For data to imitate, and to know what a task's best possible score is. In Searing Spotlights the player goes straight
-through the light; where the path of Endless Mystery Path goes left, it stops, since nobody can follow it.
+For data to imitate, and to compare agents with. In Searing Spotlights the player goes straight through the light; where
+the path of Endless Mystery Path goes left, it stops, since nobody can follow it.
 """
 
 from typing import Any
@@ -14,13 +14,13 @@ import gymnasium as gym
 import numpy as np
 
 from memory_gym_envs.base import MemoryGymVectorEnv
+from memory_gym_envs.drawing import SCREEN
+from memory_gym_envs.mortar_mayhem.arena import TILE
 from memory_gym_envs.mystery_path import MysteryPath
 from memory_gym_envs.mystery_path.drawing import tile_centres
 from memory_gym_envs.mystery_path.state import EAST, WEST
 from memory_gym_envs.searing_spotlights import SearingSpotlights
 from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE
-
-TILE, SCREEN = 14, 84
 
 
 def choices(env: Any) -> int:

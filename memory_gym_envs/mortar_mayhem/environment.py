@@ -306,7 +306,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         return numbers | {"carried_out": carried_out, "is_success": carried_out == 1}
 
     def oracle(self) -> dict[str, np.ndarray]:
-        """The whole task in plain numbers, (N, ...): besides `seed` and `length`,
+        """The whole task in plain numbers, fresh arrays (N, ...). Besides `seed` and `length`:
 
         `position` (N, 2), the agent's centre in pixels, x and y; `tile` and `target_tile` (N, 2), column and row of its
         tile and of the one that the command leads to; `command` (N,), its index in COMMANDS; `commands_left` (N,), in

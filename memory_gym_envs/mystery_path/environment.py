@@ -302,7 +302,7 @@ class MysteryPath(MemoryGymVectorEnv):
         return numbers | {"success": success.astype(np.int64), "num_fails": s.fails[lanes], "is_success": success}
 
     def oracle(self) -> dict[str, np.ndarray]:
-        """The whole task in plain numbers, (N, ...): besides `seed` and `length`,
+        """The whole task in plain numbers, fresh arrays (N, ...). Besides `seed` and `length`:
 
         `position` (N, 2), the agent's centre in pixels, x and y; `tile` (N, 2), its column and row; `next_tile` (N, 2),
         the path's next one from where the agent last was on it; `falls` (N,); in the finite ids `goal_tile` (N, 2) and

@@ -300,7 +300,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         return numbers | {"coins_collected": share, "success": success, "is_success": success == 1}
 
     def oracle(self) -> dict[str, np.ndarray]:
-        """The whole task in plain numbers, (N, ...): besides `seed` and `length`,
+        """The whole task in plain numbers, fresh arrays (N, ...). Besides `seed` and `length`:
 
         `position` (N, 2), the agent's centre in pixels, x and y; `coins` (N, C, 2), the coins', NaN where one is gone;
         `coins_left` and `coins_collected` (N,); `health` (N,); in the finite id `exit` (N, 2), NaN where there is none,
