@@ -1,4 +1,4 @@
-"""Plays random episodes here and in memory-gym 1.0.2, and reports every difference.
+"""Plays random episodes here and in memory-gym, and reports every difference.
 
     python benchmarks/fuzz_original.py [--original PYTHON] [--minutes M] [--seed S] [--ids ID ...]
     python benchmarks/fuzz_original.py [--original PYTHON] --seed S --first E --episodes 1
@@ -7,7 +7,8 @@ An episode is an id, a level, reset options from anywhere in their documented ra
 for a while, or those of a scripted player who stumbles. It is played here first. Then the original, a process of an
 interpreter that has memory-gym, plays the same actions in a new environment. Compared are rewards, ends, the final
 info, and at every step ground truth, command vector and all pixels of the frame. Without --original such an interpreter
-is made for the time of the run, from the package index.
+is made for the time of the run, with memory-gym 1.0.2 from the package index. It may also have 1.0.3, from the author's
+repository; then its options are drawn, too, and Endless Mystery Path is played by its rule.
 
 Prints how many episodes differ and in what, and of each kind the first, with the options that show it alone. What
 docs/environments.md lists as a difference is counted apart. The exit code is 1 if anything else differs.
@@ -25,6 +26,7 @@ import venv
 import zlib
 from collections import Counter
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +37,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = (["gymnasium", "numpy", "pygame"], ["--no-deps", "memory-gym==1.0.2"])
 LONGEST = 500  # steps of an episode
 KINDS = ("crash", "reward", "end", "info", "ground truth", "command vector", "frame")
-NEW = ("coin_enabled", "coin_feedback", "spawn_delay")  # options that the original lacks
-NOT_COMPARED = f"""Left out:
-  {", ".join(NEW)}, which are new
+LACKS = {"1.0.3": {"coin_feedback", "spawn_delay", "origin_restores_stamina"}}  # options that a version has not
+LACKS["1.0.2"] = LACKS["1.0.3"] | {"coin_enabled", "reward_new_command_success", "reward_path_progress_dense"}
+AS_IN = {"1.0.2": {}, "1.0.3": {"Endless-MysteryPath-v0": {"origin_restores_stamina": False}}}  # given here alone
+NOT_COMPARED = """Left out:
+  options that this version lacks
   num_spawns above 1000, of which the original makes a list
   a smallest radius or speed above the largest
   ground truth of ids for which the original has none; debug frames, which show other things here"""
@@ -80,6 +84,7 @@ def serve() -> None:
     answers, sys.stdout = sys.stdout, sys.stderr
     import memory_gym  # noqa: F401 (registers the ids)
 
+    print(json.dumps(metadata.version("memory-gym")), file=answers, flush=True)
     np.seterr(all="ignore")  # a share of no coins
     gym.logger.min_level = gym.logger.ERROR
     for line in sys.stdin:
@@ -101,9 +106,9 @@ def make_original(folder: str) -> str:
 # ---- episodes ----
 
 
-def draw_options(rng: np.random.Generator, table: tuple[Any, ...]) -> dict[str, Any]:
-    """Reset options: each of the table's that the original has, with the same chance, which is drawn as well."""
-    table = tuple(option for option in table if option.name not in NEW)
+def draw_options(rng: np.random.Generator, table: tuple[Any, ...], version: str = "1.0.2") -> dict[str, Any]:
+    """Reset options: each of the table's that the version has, with the same chance, which is drawn as well."""
+    table = tuple(option for option in table if option.name not in LACKS[version])
     chance, defaults = rng.choice([0.0, 0.1, 0.3, 1.0]), {option.name: option.default for option in table}
     values = {option.name: draw_value(rng, option) for option in table if rng.random() < chance}
     if "num_spawns" in values:
@@ -179,6 +184,9 @@ def excuse(found: dict[str, int], ours: dict, theirs: dict, env_id: str, options
     if "info" in found and math.isnan(theirs["info"].get("coins_collected", 0)):
         known.append("the share of no coins is NaN there and 1 here")
         del found["info"]
+    if "frame" in found and not options.get("coin_enabled", True):
+        known.append("coin_enabled=False paints the floor black there")
+        del found["frame"]
     crashes = {
         "num_coins=[]": not coins,
         "use_exit=False": not options.get("use_exit", True),
@@ -202,6 +210,7 @@ class Fuzz:
         self.envs = {env_id: gym.make(env_id, disable_env_checker=True).unwrapped for env_id in memory_gym_envs.IDS}
         command, self.seed = [original, str(Path(__file__).resolve()), "--serve"], seed
         self.original = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.version = json.loads(self.original.stdout.readline())
         self.counts, self.known, self.differ = Counter(), Counter(), dict.fromkeys(KINDS, 0)
 
     def episode(self, ids: list[str], number: int) -> None:
@@ -209,8 +218,9 @@ class Fuzz:
         rng = np.random.default_rng([self.seed, number])
         env_id, level = str(rng.choice(ids or list(self.envs))), int(rng.integers(2**31))
         env = self.envs[env_id]
-        options = draw_options(rng, env.batch.variant.options)
-        ours = play(env, level, options, choose_actions(rng, env), theirs=False)
+        options = draw_options(rng, env.batch.variant.options, self.version)
+        rule = AS_IN[self.version].get(env_id, {})
+        ours = play(env, level, options | rule, choose_actions(rng, env), theirs=False)
         print(json.dumps([env_id, level, options, ours["actions"]]), file=self.original.stdin, flush=True)
         theirs = json.loads(self.original.stdout.readline())
         rewards = [abs(value) for name, value in env.reset_params.items() if name.startswith("reward_")]
@@ -228,7 +238,7 @@ class Fuzz:
 def main() -> int:
     """Run for a while, and print what was found."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--original", help="an interpreter that has memory-gym 1.0.2 (default: one is made)")
+    parser.add_argument("--original", help="an interpreter that has memory-gym (default: one is made)")
     parser.add_argument("--minutes", type=float, default=10.0, help="time of the run (default: 10)")
     parser.add_argument("--episodes", type=int, default=10**9, help="end after so many (default: no limit)")
     parser.add_argument("--seed", type=int, default=0, help="of the draws (default: 0)")

@@ -9,12 +9,14 @@ from gymnasium.envs.registration import register
 
 from memory_gym_envs.base import MemoryGymVectorEnv
 from memory_gym_envs.mortar_mayhem import MortarMayhem
+from memory_gym_envs.mystery_path import EASY as EASY_MYSTERY_PATH
 from memory_gym_envs.mystery_path import MysteryPath
 from memory_gym_envs.options import Option
 from memory_gym_envs.searing_spotlights import SearingSpotlights
 from memory_gym_envs.single import MemoryGymEnv
 
 __all__ = [
+    "EASY_MYSTERY_PATH",
     "IDS",
     "MemoryGymEnv",
     "MemoryGymVectorEnv",

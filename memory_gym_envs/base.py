@@ -15,12 +15,11 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Discrete, MultiDiscrete
 from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from memory_gym_envs.drawing import gray, magnify
 from memory_gym_envs.entries import vector_space
-from memory_gym_envs.old_gymnasium import warn_of_wrappers
+from memory_gym_envs.old_gymnasium import AutoresetMode, VectorEnv, warn_of_wrappers
 from memory_gym_envs.options import brief, complete_options
 from memory_gym_envs.saving import Saved, is_generator, plain, restored
 from memory_gym_envs.state import grows

@@ -1,10 +1,40 @@
-"""Vector wrappers of older versions of Gymnasium are wrong with same-step autoreset: whoever uses one is told."""
+"""What older versions of Gymnasium need: names that they lack, and a warning of their wrong wrappers.
+
+Before 1.1, single environments alone are tested. Before 1.4, vector wrappers are wrong with same-step autoreset, and
+whoever uses one is told.
+"""
 
 import sys
+from enum import Enum
 from functools import cache
 from types import FrameType
+from typing import TYPE_CHECKING
 
 import gymnasium as gym
+
+__all__ = ["AutoresetMode", "VectorEnv", "warn_of_wrappers"]
+
+
+def version() -> tuple[int, ...]:
+    """The first two numbers of Gymnasium's version."""
+    return tuple(int(part) for part in gym.__version__.split(".")[:2])
+
+
+if TYPE_CHECKING or version() >= (1, 1):
+    from gymnasium.vector import AutoresetMode, VectorEnv
+else:
+    if version() >= (1, 0):
+        from gymnasium.vector import VectorEnv
+    else:
+        from gymnasium.experimental.vector import VectorEnv
+
+    class AutoresetMode(Enum):
+        """When an ended episode is reset."""
+
+        NEXT_STEP = "NextStep"
+        SAME_STEP = "SameStep"
+        DISABLED = "Disabled"
+
 
 MENDED = (1, 4)  # the version of Gymnasium in which they are right
 WRONG = {
@@ -16,7 +46,7 @@ WRONG = {
 
 def warn_of_wrappers() -> None:
     """Warns of those around an environment whose reset() calls this: they are resetting, too, so they are callers."""
-    if tuple(int(part) for part in gym.__version__.split(".")[:2]) >= MENDED:
+    if version() >= MENDED:
         return
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:

@@ -64,12 +64,15 @@ class MemoryGymEnv(gym.Env):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One step. The info of an episode's last step also has its summary in plain numbers.
 
+        action: in `action_space`, or an array of one such action, as some pass a number to the original.
         Raises ValueError for a wrong action, ResetNeeded before the first reset and after an episode's end.
         """
         if self._needs_reset:
             raise gym.error.ResetNeeded("call reset() before step(), at the start and after every episode's end")
         batch = self.batch
-        lone = action[None] if isinstance(action, np.ndarray) else [action]
+        lone = [action]
+        if isinstance(action, np.ndarray):
+            lone = action if action.shape == batch.action_space.shape else action[None]
         try:
             actions = batch.checked_actions(lone)
         except ValueError:

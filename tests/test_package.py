@@ -62,7 +62,7 @@ def test_the_environments_alone(alone):
 
 def test_they_need_numpy_and_gymnasium(alone):
     needed = metadata(alone).get_all("Requires-Dist")
-    assert [line for line in needed if "extra ==" not in line] == ["gymnasium<2,>=1.1", "numpy>=1.26"]
+    assert [line for line in needed if "extra ==" not in line] == ["gymnasium<2,>=0.29", "numpy>=1.26"]
     assert set(metadata(alone).get_all("Provides-Extra")) == {"play", "sb3"}
 
 

@@ -87,7 +87,8 @@ class MortarMayhem(MemoryGymVectorEnv):
     ## Rewards
 
     `reward_command_success` (0.1) for each command that is carried out when it is checked, `reward_command_failure` (0)
-    on a burning tile, `reward_episode_success` (0) added when the last command is checked.
+    on a burning tile, `reward_episode_success` (0) added when the last command is checked; in the endless id,
+    `reward_new_command_success` (0) added when the last command of a sequence, its newest, is carried out.
 
     ## Episode End
 
@@ -188,6 +189,7 @@ class MortarMayhem(MemoryGymVectorEnv):
         s.reward_success[lanes] = values["reward_command_success"]
         s.reward_failure[lanes] = values["reward_command_failure"]
         s.reward_episode[lanes] = values.get("reward_episode_success", 0.0)
+        s.reward_new_command[lanes] = values.get("reward_new_command_success", 0.0)
         s.step_limit[lanes] = limit_of(values.get("max_steps", -1))
         self.figures, s.figure[:] = numbered([self._figure(each) for each in self.settings])
         self.place_tables()

@@ -30,6 +30,7 @@ def option_rows(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
     delay, duration = ((6,), (2,)) if grid else ((18,), (6,))
     smallest, largest = ARENA_SIZES[0], ARENA_SIZES[-1]
     most = 100 if clue else VECTOR_COMMANDS
+    new_command = "reward added when the newest command, a sequence's last, is carried out"
     rows = [
         (endless, max_steps(-1)),
         (True, agent_scale(ignored=grid)),
@@ -49,6 +50,7 @@ def option_rows(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
             not endless,
             Option("reward_episode_success", 0.0, "float", None, None, "reward added with the last command's"),
         ),
+        (endless, Option("reward_new_command_success", 0.0, "float", None, None, new_command)),
     ]
     return present(rows)
 

@@ -53,7 +53,8 @@ def ignite_tiles(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     s.floor[red] = s.target[red]
     success = on_target(s, lanes)
     s.completed[lanes] += success
-    return s.reward_success[lanes] * success, s.current[lanes] >= s.count[lanes]
+    sequence_over = s.current[lanes] >= s.count[lanes]
+    return (s.reward_success[lanes] + s.reward_new_command[lanes] * sequence_over) * success, sequence_over
 
 
 def extinguish_tiles(s: State, lanes: np.ndarray) -> None:

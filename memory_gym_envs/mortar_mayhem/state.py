@@ -51,3 +51,4 @@ class State:
     reward_success: np.ndarray = array("N", dtype=np.float64)
     reward_failure: np.ndarray = array("N", dtype=np.float64)
     reward_episode: np.ndarray = array("N", dtype=np.float64)
+    reward_new_command: np.ndarray = array("N", dtype=np.float64)

@@ -97,7 +97,8 @@ class MysteryPath(MemoryGymVectorEnv):
     ## Rewards
 
     `reward_goal` (1) at the goal, `reward_path_progress` (0.1, Grid 0) when any tile of the path but the origin and the
-    goal is reached for the first time, `reward_fall_off` (0) in the pit, and `reward_step` (0) at every step.
+    goal is reached for the first time, `reward_fall_off` (0) in the pit, and `reward_step` (0) at every step. Endless id:
+    also `reward_path_progress_dense` (0) at each tile's first visit since the last fall, the origin apart.
 
     ## Episode End
 
@@ -133,7 +134,8 @@ class MysteryPath(MemoryGymVectorEnv):
 
     ## Version History
 
-    - v0: as in memory-gym 1.0.2, except for the differences below.
+    - v0: as in memory-gym 1.0.2, except for the differences below. In 1.0.3, the origin of the endless path does not
+      restore stamina: `origin_restores_stamina=False`.
 
     ## References
 
@@ -184,8 +186,10 @@ class MysteryPath(MemoryGymVectorEnv):
         s.reward_goal[lanes] = values.get("reward_goal", 0.0)
         s.reward_fall_off[lanes] = values["reward_fall_off"]
         s.reward_progress[lanes] = values["reward_path_progress"]
+        s.reward_dense[lanes] = values.get("reward_path_progress_dense", 0.0)
         s.reward_step[lanes] = values["reward_step"]
         s.stamina_level[lanes] = values.get("stamina_level", 1)
+        s.origin_restores[lanes] = values.get("origin_restores_stamina", False)
         if self.variant.endless:
             self._place_camera(lanes, values)
         self.figures, s.figure[:] = numbered([self._figure(each) for each in self.settings])

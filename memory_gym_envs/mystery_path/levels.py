@@ -14,6 +14,7 @@ from memory_gym_envs.mystery_path.state import (
     DIRECTIONS,
     EAST,
     NO_STEP,
+    ORIGIN,
     PIT,
     PIT_ROWS,
     ROWS,
@@ -182,7 +183,7 @@ def write_level(s: State, lane: int, level: Level, endless: bool) -> None:
     s.length[lane] = s.episode_return[lane] = 0
     write_path(s, lane, level, endless)
     s.reached[lane] = 0
-    s.reached[lane, PIT] = s.reached[lane, 1] = UNREWARDED
+    s.reached[lane, PIT] = s.reached[lane, ORIGIN] = UNREWARDED
     if not endless:
         s.reached[lane, len(level.path)] = UNREWARDED  # the goal has a reward of its own
     column, row = divmod(level.path[0] - PIT_ROWS, ROWS)
@@ -192,8 +193,8 @@ def write_level(s: State, lane: int, level: Level, endless: bool) -> None:
     s.pos[lane] = s.origin[lane] = x + PAD, y + PAD
     s.tile[lane] = x // TILE, y // TILE
     s.facing[lane] = 6 if endless else 0
-    s.path_step[lane], s.last_path_step[lane] = NO_STEP, 1  # the first step lands on the origin
-    s.next_direction[lane] = s.direction_at[lane, 1]
+    s.path_step[lane], s.last_path_step[lane] = NO_STEP, ORIGIN  # the first step lands on it
+    s.next_direction[lane] = s.direction_at[lane, ORIGIN]
     s.stamina[lane] = s.stamina_level[lane]
 
 

@@ -11,6 +11,9 @@ TILE = 12  # pixels
 SIDE = 7  # tiles along one side of the screen, and of a segment of the endless path
 SEGMENT = SIDE + 1  # columns of a segment and the transition tile behind it
 
+# Of the finite ids: what AGaLiTe (Pramanik et al., 2023) calls easy.
+EASY = {"show_origin": True, "show_goal": True, "reward_path_progress": 0.1}
+
 SHOWN = {  # by the options that show something: the state has a field show_... for each
     "origin": "show_origin",
     "goal": "show_goal",
@@ -24,6 +27,8 @@ def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
     """The reset options of an id, in the original's order."""
     steps, progress = -1 if endless else 128 if grid else 512, 0.0 if grid else 0.1
     origin = "show the path's origin in blue"
+    refill = "the path's origin restores stamina, as new tiles do; false, as in memory-gym 1.0.3: it does not"
+    dense = "reward added for each tile that is new since the last fall"
     sides = "where the path starts: 0 left, 1 right, 2 top, 3 bottom"
     camera = "how many tiles from the screen's left edge the agent is drawn"
     rows = [
@@ -39,9 +44,11 @@ def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
         (True, Option("visual_feedback", True, "bool", None, None, "show a red cross where the agent falls off")),
         (endless, Option("camera_offset_scale", 5.0, "float", 0.0, 5.5, camera)),
         (endless, Option("stamina_level", 20, "int", 1, None, "steps until the agent must have reached a new tile")),
+        (endless, Option("origin_restores_stamina", True, "bool", None, None, refill)),
         (not endless, Option("reward_goal", 1.0, "float", None, None, "reward for reaching the goal")),
         (True, Option("reward_fall_off", 0.0, "float", None, None, "reward for falling off the path")),
         (True, Option("reward_path_progress", progress, "float", None, None, "reward for each new tile of the path")),
+        (endless, Option("reward_path_progress_dense", 0.0, "float", None, None, dense)),
         (True, Option("reward_step", 0.0, "float", None, None, "reward for every step")),
     ]
     return present(rows)

@@ -7,7 +7,7 @@ import numpy as np
 
 from memory_gym_envs.character import FACINGS, PAD, SPAN
 from memory_gym_envs.mystery_path.options import SIDE, TILE
-from memory_gym_envs.mystery_path.state import NO_STEP, PIT_ROWS, ROWS, WEST, State
+from memory_gym_envs.mystery_path.state import NO_STEP, ORIGIN, PIT_ROWS, ROWS, WEST, State
 
 BRANCHES = np.array([3, 1])  # numbers the actions of two branches from 0 to 8
 TILE_AT = (np.arange(SPAN) - PAD) // TILE  # of stored positions on the screen
@@ -44,8 +44,10 @@ def enter_tiles(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: b
         rewards += fresh * s.reward_progress
         s.visited += fresh
     if endless:
-        # A tile gives stamina back the first time since the last fall. So does the origin.
-        np.copyto(s.stamina, s.stamina_level, where=before != now)
+        # A tile restores stamina the first time since the last fall. The pit, always new, does as well.
+        new, at_origin = before != now, s.path_step == ORIGIN
+        np.copyto(s.stamina, s.stamina_level, where=new & (s.origin_restores | ~at_origin))
+        rewards += (new & ~s.fallen & ~at_origin) * s.reward_dense
     s.reached.put(here, now)
     if np.count_nonzero(s.fallen):
         rewards += s.fallen * s.reward_fall_off

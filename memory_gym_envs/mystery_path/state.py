@@ -22,6 +22,7 @@ FAST = 14  # pixels: an agent that walks further in a step can leave the stored 
 
 PIT = 0  # the step at cells that are not on the path
 NO_CELL = -1  # the cell of step PIT
+ORIGIN = 1  # the step at the origin
 NO_STEP = -1  # the step of an agent that is put back to the origin
 UNREWARDED = -1  # in `reached`: the agent was not there yet, and earns nothing for it
 
@@ -89,9 +90,11 @@ class State:
     cross_fits: np.ndarray = array("N", dtype=bool)  # some of that cross is left of the stamina bar
     step_limit: np.ndarray = array("N")  # steps until truncation
     stamina_level: np.ndarray = array("N")
+    origin_restores: np.ndarray = array("N", dtype=bool)  # stamina
     reward_goal: np.ndarray = array("N", dtype=np.float64)
     reward_fall_off: np.ndarray = array("N", dtype=np.float64)
     reward_progress: np.ndarray = array("N", dtype=np.float64)
+    reward_dense: np.ndarray = array("N", dtype=np.float64)
     reward_step: np.ndarray = array("N", dtype=np.float64)
 
 

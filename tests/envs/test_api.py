@@ -202,6 +202,7 @@ def test_wrong_actions(env_id):
     for fine in (right, right.tolist(), right.astype(np.int8), right.astype(np.uint64)):
         envs.step(fine)
     env.step(right[0].tolist())
+    env.step(right[:1])
 
 
 @EACH

@@ -1,4 +1,4 @@
-"""What memory-gym 1.0.2 does where no recording leads. The expected values are what it gave."""
+"""What memory-gym 1.0.2 does where no recording leads, and 1.0.3. The expected values are what they gave."""
 
 import copy
 import json
@@ -15,7 +15,7 @@ from memory_gym_envs import IDS
 from memory_gym_envs.character import DIAGONAL_FORTH, PAD, SPAN, STRIDES, Figure, sprites, walk_table
 from memory_gym_envs.drawing import ring
 from memory_gym_envs.options import complete_options
-from memory_gym_envs.players import stumbling
+from memory_gym_envs.players import player, stumbling
 from memory_gym_envs.searing_spotlights.drawing import draw_coins_and_exits
 
 CROWD = {"spawn_interval": 1, "spot_min_speed": 1e-5, "spot_max_speed": 1e-4, "spot_damage": 0.0, "steps_per_coin": -1}
@@ -294,14 +294,49 @@ def test_options_together(env_id, seed, chance, options, expected):
     assert zlib.crc32(json.dumps(found).encode()) == expected
 
 
+# ---- 1.0.3 ----
+
+
+def paid(env_id, seed, options, actions):
+    """The steps that were rewarded, with their rewards, and the episode's length."""
+    env, rewards, over = gym.make(env_id).unwrapped, [], False
+    env.reset(seed=seed, options=options)
+    for action in actions:
+        if not over:
+            _, reward, terminated, truncated, _ = env.step(action(env) if callable(action) else action)
+            rewards.append(round(reward, 6))
+            over = terminated or truncated
+    return {step: reward for step, reward in enumerate(rewards) if reward}, len(rewards)
+
+
+def test_the_newest_command_has_a_reward_of_its_own():
+    actions = [lambda env: player(env.batch)[0]] * 200 + [[0, 0]] * 100
+    rewards, length = paid("Endless-MortarMayhem-v0", 4, {"reward_new_command_success": 1.0}, actions)
+    assert (list(rewards.values()), length) == ([1.1, 0.1, 1.1, 0.1, 0.1, 1.1, 0.1, 0.1], 226)
+
+
+@pytest.mark.parametrize(("restores", "longest"), [(False, 27), (True, 28)])
+def test_tiles_pay_again_after_a_fall_and_the_origin_may_restore_stamina(restores, longest):
+    options = {"reward_path_progress_dense": 0.01, "origin_restores_stamina": restores}
+    off_the_path = [1] * 6 + [3] * 4
+    rewards, _ = paid("Endless-MysteryPath-v0", 4, options, off_the_path + [1] * 10)
+    assert rewards == {1: 0.11, 5: 0.11, 11: 0.01, 15: 0.01, 19: 0.11}
+    assert paid("Endless-MysteryPath-v0", 4, options, off_the_path + [0] * 30) == ({1: 0.11, 5: 0.11}, longest)
+
+
 # ---- benchmarks/fuzz_original.py ----
 
 
 @EACH
 def test_fuzz_draws_valid_options(env_id):
     table = gym.make(env_id).unwrapped.batch.variant.options
-    for seed in range(100):
-        complete_options(table, fuzz_original.draw_options(np.random.default_rng(seed), table), env_id)
+    for version, rule in fuzz_original.AS_IN.items():
+        lacks, drawn = fuzz_original.LACKS[version], set()
+        for seed in range(100):
+            options = fuzz_original.draw_options(np.random.default_rng(seed), table, version)
+            complete_options(table, options | rule.get(env_id, {}), env_id)
+            drawn |= options.keys()
+        assert drawn == {option.name for option in table} - lacks
 
 
 @pytest.mark.parametrize("env_id", IDS)
