@@ -98,7 +98,7 @@ class MysteryPath(MemoryGymVectorEnv):
 
     `reward_goal` (1) at the goal, `reward_path_progress` (0.1, Grid 0) when any tile of the path but the origin and the
     goal is reached for the first time, `reward_fall_off` (0) in the pit, and `reward_step` (0) at every step.
-    In the endless id also `reward_path_progress_dense` (0) at a tile's first visit since the last fall, the origin apart.
+    Endless id: also `reward_path_progress_dense` (0) at a tile's first visit since the last fall, the origin apart.
 
     ## Episode End
 

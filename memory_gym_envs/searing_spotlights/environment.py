@@ -133,7 +133,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
     work; the share of no coins is 1, not NaN; coins for which no free pixel is left are put anywhere; a smallest radius
     or speed above the largest replaces it; wrong options raise ValueError.
 
-    Options that the original lacks: `coin_enabled`, which came with 1.0.3; `coin_feedback`, as what follows a coin tells
+    Options that 1.0.2 lacks: `coin_enabled`, new in 1.0.3; `coin_feedback`, as what follows a coin tells
     the agent where it is (thesis 7.3.3, 8.3.1): without it, the next coin stays in the dark until light falls on it,
     and the bar doesn't show the coin's reward; `spawn_delay`, for spotlights at random intervals (7.3.3).
     """
