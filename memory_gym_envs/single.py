@@ -70,7 +70,7 @@ class MemoryGymEnv(gym.Env):
         if self._needs_reset:
             raise gym.error.ResetNeeded("call reset() before step(), at the start and after every episode's end")
         batch = self.batch
-        lone = [action]
+        lone: Any = [action]
         if isinstance(action, np.ndarray):
             lone = action if action.shape == batch.action_space.shape else action[None]
         try:
