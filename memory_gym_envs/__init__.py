@@ -5,15 +5,13 @@ a namespace, as memory_gym_envs/MortarMayhem-v0, since the original registers th
 leaves `gym.make` of those to whichever was imported last.
 """
 
-from gymnasium.envs.registration import register
-
 from memory_gym_envs.base import MemoryGymVectorEnv
 from memory_gym_envs.mortar_mayhem import MortarMayhem
 from memory_gym_envs.mystery_path import EASY as EASY_MYSTERY_PATH
 from memory_gym_envs.mystery_path import MysteryPath
 from memory_gym_envs.options import Option
 from memory_gym_envs.searing_spotlights import SearingSpotlights
-from memory_gym_envs.single import MemoryGymEnv
+from memory_gym_envs.single import MemoryGymEnv, MortarMayhemEnv, MysteryPathEnv, SearingSpotlightsEnv, register
 
 __all__ = [
     "EASY_MYSTERY_PATH",
@@ -24,17 +22,12 @@ __all__ = [
     "MysteryPath",
     "Option",
     "SearingSpotlights",
+    "register",
 ]
 
 FAMILIES = (MortarMayhem, MysteryPath, SearingSpotlights)
 IDS = tuple(variant for family in FAMILIES for variant in family.variants)
 
-for _family in FAMILIES:
-    for _id in _family.variants:
-        for _name in (_id, f"memory_gym_envs/{_id}"):
-            register(
-                id=_name,
-                entry_point=f"memory_gym_envs.single:{_family.__name__}Env",
-                vector_entry_point=f"{_family.__module__}:{_family.__name__}",
-                kwargs={"variant": _id},
-            )
+for _environment in (MortarMayhemEnv, MysteryPathEnv, SearingSpotlightsEnv):
+    register(_environment)
+    register(_environment, namespace="memory_gym_envs")

@@ -181,6 +181,17 @@ class SearingSpotlightsEnv(MemoryGymEnv):  # noqa: D101
     __doc__, family = SearingSpotlights.__doc__, SearingSpotlights
 
 
+def register(environment: type[MemoryGymEnv], namespace: str | None = None) -> None:
+    """Registers the ids of the environment's family with Gymnasium, for `gym.make` and `gym.make_vec`.
+
+    namespace: what stands before a slash in front of each id.
+    """
+    one, many = (f"{made.__module__}:{made.__name__}" for made in (environment, environment.family))
+    for variant in environment.family.variants:
+        name = f"{namespace}/{variant}" if namespace else variant
+        gym.register(id=name, entry_point=one, vector_entry_point=many, kwargs={"variant": variant})
+
+
 def _only(observations: Any) -> Any:
     if isinstance(observations, dict):
         return {key: value[0] for key, value in observations.items()}

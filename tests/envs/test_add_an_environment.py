@@ -35,6 +35,7 @@ def test_gymnasium_s_checker(obs_type):
 
 
 def test_the_rules():
+    assert gym.spec("Recall-v0").to_json()
     env = gym.make("Recall-v0")
     frame, info = env.reset(seed=4, options=OPTIONS)
     color = int(info["ground_truth"].argmax())
