@@ -6,6 +6,7 @@ Shape letters: N lanes (parallel environments), n some of them, G entries of the
 observation.
 """
 
+import inspect
 import math
 import operator
 from collections.abc import Callable, Mapping
@@ -32,6 +33,33 @@ DEBUG_ZOOM = 4  # the debug view is 336 x 336
 ALL = slice(None)  # every lane
 NO_LIMIT = np.iinfo(np.int64).max  # of steps
 LEVEL_STREAM = 1  # keeps the generator that chooses levels apart from the one that builds them
+# How the docstring of each family ends.
+SHARED_DOC = """
+In all ids, other than in the original, images are rows first, `max_steps` truncates, the ground truth is reported, and
+wrong options raise ValueError.
+
+## Arguments
+
+`gym.make(id, ...)` and `gym.make_vec(id, num_envs=N, ...)` take
+
+| name | default | meaning |
+|---|---|---|
+| `render_mode` | None | "rgb_array": what the agent sees; "debug_rgb_array": 336 x 336, with the ground truth |
+| `num_levels`, `start_level` | None, 0 | resets without a seed play one of so many levels, from the first on |
+| `obs_type` | "pixels" | or "grayscale": one channel; or "vector" |
+| `action_type` | "native" | or "discrete": one number of nine instead of two of three |
+| `options` | None | reset parameters that are the environment's defaults |
+| `max_episode_steps` | None | truncates longer episodes |
+| `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
+
+`reset(options={...})` takes the same reset parameters, a single environment for one episode. `docs/options.md` and
+`VARIANTS[id].options` list them. Of a list, one entry is sampled at every reset.
+
+## References
+
+Marco Pleines: Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games. Dissertation, TU
+Dortmund University. Marco Pleines, Matthias Pallasch, Frank Zimmer, Mike Preuss: Memory Gym, arXiv:2309.17207.
+"""
 # What a subclass has to define.
 OF_A_FAMILY = ("variants", "spaces", "allocate", "begin", "advance", "vectors", "frames", "ground_truth", "summary")
 # Of what a saved state has for each lane: what it must be.
@@ -84,6 +112,11 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
     truth_high: ClassVar[float] = 1.0  # the ground truth's largest value; the least is 0
     kept: ClassVar[tuple[str, ...]] = ("ready", "settings", "_rngs", "_level_rngs", "_seeds", "_over")
     state: Any  # the family's State, a dataclass of `state.array`s; saved besides what is `kept`
+
+    def __init_subclass__(cls) -> None:
+        """Appends to the family's docstring what all have."""
+        if cls.__doc__:
+            cls.__doc__ = f"{inspect.cleandoc(cls.__doc__)}\n{SHARED_DOC}"
 
     def __init__(
         self,

@@ -81,8 +81,16 @@ def test_they_say_who_made_them(alone, whole):
 def test_they_work_alone(alone, tmp_path):
     alone.extractall(tmp_path)
     code = "import gymnasium, memory_gym_envs as m; gymnasium.make_vec(m.IDS[0], num_envs=2).reset(); print(m.__file__)"
-    done = run(tmp_path, "-c", code)
+    # The whole repository is installed, too, where tests run.
+    done = run(tmp_path, "-W", "ignore:memory-gym-envs and", "-c", code)
     assert (done.stdout.strip(), done.stderr) == (str(tmp_path / "memory_gym_envs" / "__init__.py"), "")
+
+
+def test_two_installations_are_told(alone, whole, tmp_path):
+    for built in (whole, alone):
+        built.extractall(tmp_path)
+    done = run(tmp_path, "-c", "import memory_gym_envs")
+    assert "memory-gym-envs and memory-gym-baselines both install memory_gym_envs" in done.stderr
 
 
 def test_the_whole_repository_leaves_common_names_free(whole):

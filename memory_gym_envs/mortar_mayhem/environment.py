@@ -106,31 +106,9 @@ class MortarMayhem(MemoryGymVectorEnv):
     finite ids add `carried_out`, the share of commands whose tile the agent was on when all others caught fire, which a
     failed last command does not raise, and `is_success`, whether that is all of them.
 
-    ## Arguments
-
-    `gym.make(id, ...)` and `gym.make_vec(id, num_envs=N, ...)` take
-
-    | name | default | meaning |
-    |---|---|---|
-    | `render_mode` | None | "rgb_array": what the agent sees; "debug_rgb_array": 336 x 336, with the ground truth |
-    | `num_levels`, `start_level` | None, 0 | resets without a seed play one of num_levels levels, from start_level on |
-    | `obs_type` | "pixels" | "pixels", "grayscale": one channel, or "vector" |
-    | `action_type` | "native" | or "discrete": one number of nine instead of two of three |
-    | `options` | None | reset parameters that are the environment's defaults |
-    | `max_episode_steps` | None | truncates longer episodes |
-    | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
-
-    `reset(options={...})` takes the same reset parameters, a single environment for one episode. `docs/options.md` and
-    `VARIANTS[id].options` list them. Of a list, one entry is sampled at every reset.
-
     ## Version History
 
     - v0: as in memory-gym 1.0.2, except for the differences below.
-
-    ## References
-
-    Marco Pleines: Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games. Dissertation, TU
-    Dortmund University. Marco Pleines, Matthias Pallasch, Frank Zimmer, Mike Preuss: Memory Gym, arXiv:2309.17207.
 
     ## Kept from the original
 
@@ -147,11 +125,7 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     ## Differences from the original
 
-    - Images are rows first.
-    - max_steps truncates.
-    - Every id reports the ground truth.
     - An episode's first frames show this episode's agent, not the last one's.
-    - Wrong options raise ValueError.
     """
 
     variants = VARIANTS

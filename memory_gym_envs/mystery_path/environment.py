@@ -115,44 +115,22 @@ class MysteryPath(MemoryGymVectorEnv):
     `success` and `is_success`; in the endless id, instead of these two, `tiles_visited` and `max_x`, the rightmost
     column of the path that the agent reached.
 
-    ## Arguments
-
-    `gym.make(id, ...)` and `gym.make_vec(id, num_envs=N, ...)` take
-
-    | name | default | meaning |
-    |---|---|---|
-    | `render_mode` | None | "rgb_array": what the agent sees; "debug_rgb_array": 336 x 336, with the ground truth |
-    | `num_levels`, `start_level` | None, 0 | resets without a seed play one of so many levels, from the first on |
-    | `obs_type` | "pixels" | or "grayscale" (one channel), or "vector" |
-    | `action_type` | "native" | or "discrete": one number of nine instead of two of three |
-    | `options` | None | reset parameters that are the environment's defaults |
-    | `max_episode_steps` | None | truncates longer episodes |
-    | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
-
-    `reset(options={...})` takes the same reset parameters, a single environment for one episode. `docs/options.md` and
-    `VARIANTS[id].options` list them. Of a list, one entry is sampled at every reset.
-
     ## Version History
 
-    - v0: as in memory-gym 1.0.2, except for the differences below. In 1.0.3, the origin of the endless path does not
+    - v0: as in memory-gym 1.0.2, except for what is said below. In 1.0.3, the origin of the endless path does not
       restore stamina: `origin_restores_stamina=False`.
 
-    ## References
+    ## Kept from the original
 
-    Marco Pleines: Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games. Dissertation, TU
-    Dortmund University. Marco Pleines, Matthias Pallasch, Frank Zimmer, Mike Preuss: Memory Gym, arXiv:2309.17207.
-
-    ## Kept from the original, and differences
-
-    Kept from the original: the agent starts its radius away from the left and upper edge of its tile, so one of scale
-        0.48 or more starts beside the origin; the Grid id ignores agent_scale, the endless id show_origin. Steps are
-        cut off to whole pixels, a diagonal one to 2 pixels at the default speed. In the endless id the camera's
-        fraction of a pixel is cut off, the background jumps at speeds that do not divide 12, and the places where the
-        agent fell off count until the episode ends. Of the path's leftmost column that is shown behind the agent, only
-        one tile is drawn, and nothing is drawn while the agent is in the first column. Where the endless path goes
-        left, the agent cannot follow it.
-    Differences from the original: images are rows first; max_steps truncates; every id reports ground truth; wrong
-        options raise ValueError.
+    - The agent starts its radius away from the left and upper edge of its tile, so one of scale 0.48 or more starts
+      beside the origin.
+    - The Grid id ignores `agent_scale`, the endless id `show_origin`.
+    - Steps are cut off to whole pixels, a diagonal one to 2 pixels at the default speed. In the endless id the camera's
+      fraction of a pixel is cut off, and the background jumps at speeds that do not divide 12.
+    - In the endless id the places where the agent fell off count until the episode ends. Where the path goes left, the
+      agent cannot follow it.
+    - Of the path's leftmost column that is shown behind the agent, only one tile is drawn, and nothing is drawn while
+      the agent is in the first column.
     """
 
     variants = VARIANTS

@@ -88,54 +88,39 @@ class SearingSpotlights(MemoryGymVectorEnv):
     `coins_collected` (a share, 1 if there were none; in the endless id a number) and, in the finite id, `success` and
     `is_success`.
 
-    ## Arguments
+    ## Options
 
-    `gym.make(id, ...)` and `gym.make_vec(id, num_envs=N, ...)` take
-
-    | name | default | meaning |
-    |---|---|---|
-    | `render_mode` | None | "rgb_array": what the agent sees; "debug_rgb_array": 336 x 336, with the ground truth |
-    | `num_levels`, `start_level` | None, 0 | resets without a seed play one of so many levels, from the first on |
-    | `obs_type` | "pixels" | or "grayscale": one channel; or "vector" |
-    | `action_type` | "native" | or "discrete": one number of nine instead of two of three |
-    | `options` | None | reset parameters that are the environment's defaults |
-    | `max_episode_steps` | None | truncates longer episodes |
-    | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
-
-    `reset(options={...})` takes the same reset parameters, in a single environment for one episode. `docs/options.md`
-    and `VARIANTS[id].options` list them. Of a list, one entry is sampled at every reset, or for each interval. Radii
-    and speeds of spotlights are sampled between their smallest and largest.
+    Radii and speeds of spotlights are sampled between their smallest and largest, `spawn_delay` for each interval.
 
     ## Version History
 
     - v0: as in memory-gym 1.0.2, except for the differences below.
 
-    ## References
+    ## Kept from the original
 
-    Marco Pleines: Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games. Dissertation, TU
-    Dortmund University. Marco Pleines, Matthias Pallasch, Frank Zimmer, Mike Preuss: Memory Gym, arXiv:2309.17207.
+    - The bar shows the action and the reward of the step before the last.
+    - A spotlight behind one that is removed skips that step, and so does a coin behind a taken one when several are
+      touched at once.
+    - The wait for the next spotlight is always the first of the planned intervals, as each spawn removes the last one;
+      so `spawn_interval_decay` changes nothing, and neither does `reward_max_steps`.
+    - All coins but the first are a step old when they are first shown, so in the dark they are visible in one frame
+      less than `coin_show_duration` says. An endless task's coin may appear on the agent.
+    - Radii of spotlights are whole pixels, from `spot_min_radius` to `spot_max_radius`, both rounded down.
+    - The agent may start under the bar or outside the screen and steps inside with its first step; before that it is
+      drawn facing up, and no spotlight shines.
+    - Dying at the exit is no success, though it pays.
+    - Small coins (scale below 0.5) are all rim and small exits all frame. Whether what is visible in the dark is drawn
+      above the bar or below it depends on what else is visible.
 
-    ## Kept from the original, and differences
+    ## Differences from the original
 
-    Kept from the original: the bar shows the action and the reward of the step before the last. A spotlight behind one
-    that is removed skips that step, and so does a coin behind a taken one when several are touched at once. The wait
-    for the next spotlight is always the first of the planned intervals, as each spawn removes the last one; so
-    spawn_interval_decay changes nothing, and neither does reward_max_steps. All coins but the first are a step old when
-    they are first shown, so in the dark they are visible in one frame less than `coin_show_duration` says. Radii of
-    spotlights are whole pixels, from spot_min_radius to spot_max_radius, both rounded down. The agent may start under
-    the bar or outside the screen and steps inside with its first step; before that it is drawn facing up, and no
-    spotlight shines. Dying at the exit is no success, though it pays. An endless task's coin may appear on the agent.
-    Small coins (scale below 0.5) are all rim and small exits all frame. Whether what is visible in the dark is drawn
-    above the bar or below it depends on what else is visible.
-
-    Differences from the original: images are rows first; max_steps truncates; the finite id reports ground truth; what
-    an episode drew or painted black or white does not show in the next one; no exit, no coins and a hidden action bar
-    work; the share of no coins is 1, not NaN; coins for which no free pixel is left are put anywhere; a smallest radius
-    or speed above the largest replaces it; wrong options raise ValueError.
-
-    Options that 1.0.2 lacks: `coin_enabled`, new in 1.0.3; `coin_feedback`, as what follows a coin tells
-    the agent where it is (thesis 7.3.3, 8.3.1): without it, the next coin stays in the dark until light falls on it,
-    and the bar doesn't show the coin's reward; `spawn_delay`, for spotlights at random intervals (7.3.3).
+    - What an episode drew or painted black or white does not show in the next one.
+    - No exit, no coins and a hidden action bar work; the share of no coins is 1, not NaN.
+    - Coins for which no free pixel is left are put anywhere.
+    - A smallest radius or speed above the largest replaces it.
+    - Options that 1.0.2 lacks: `coin_enabled`, new in 1.0.3; `coin_feedback`, as what follows a coin tells the agent
+      where it is (thesis 7.3.3, 8.3.1): without it, the next coin stays in the dark until light falls on it, and the
+      bar doesn't show the coin's reward; `spawn_delay`, for spotlights at random intervals (7.3.3).
     """
 
     variants = VARIANTS
