@@ -11,6 +11,8 @@
     scores         interquartile means and their table; which runs are seeds of one agent
     run_logs       what runs have logged, read again
     curves         pictures and tables of that
+    memory_check   what is wrong with the memory of an agent, whoever made it
+    memory_adapters, memory_probes   such agents, and environments for those that can only be trained
     acting         a trained agent in a program of one's own
     run            what a training run consists of
     runs           a training from its command line to its end: run folder, signals

@@ -1,0 +1,41 @@
+"""Check the memory of an agent that `ppo_gru.py`, `ppo_trxl.py` or a copy of either would train.
+
+    python check_memory.py ppo_gru.py --preset laptop --memory lstm
+
+The script's flags follow its name; the agent is untrained and observes a vector. Prints a line for each check, and ends
+with 1 if there is a fault. Agents of other packages: docs/check_your_memory.md.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import torch
+
+from ppo_utils.checkpoints import import_script
+from ppo_utils.memory_adapters import ScriptAdapter
+from ppo_utils.memory_check import check
+from ppo_utils.runs import parse_args
+from ppo_utils.terminal import one_line_exit, open_streams
+
+
+def main() -> int:
+    """Check what the command line says. Raises ValueError for a script or flags that make no agent."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("script", help="a script, ppo_NAME.py, in this folder")
+    parser.add_argument("flags", nargs=argparse.REMAINDER, help="its flags")
+    given = parser.parse_args()
+    if not Path(given.script).is_file():
+        raise ValueError(f"there is no {given.script}; give a script of this folder, such as ppo_gru.py")
+    script = import_script({"script": Path(given.script).stem}, given.script)
+    args = parse_args(script.Args, script.PRESETS, given.flags)
+    torch.manual_seed(args.seed)
+    report = check(ScriptAdapter(script, args))
+    print(report)
+    return bool(report.failed)
+
+
+if __name__ == "__main__":
+    open_streams()
+    with one_line_exit(ValueError):
+        sys.exit(main())

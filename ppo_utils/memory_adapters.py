@@ -1,0 +1,146 @@
+"""Adapters of `memory_check` for agents that are at hand: this project's scripts, and Stable-Baselines3's."""
+
+from __future__ import annotations
+
+import copy
+import io
+from types import ModuleType
+from typing import Any
+
+import gymnasium as gym
+import torch
+from torch import Tensor
+
+from ppo_utils.memory_check import Adapter
+
+ENTRIES = 6  # of an observed vector
+
+
+class ScriptAdapter(Adapter):
+    """The agent of `ppo_gru.py`, `ppo_trxl.py` or a copy of either, which observes a vector.
+
+    script: the module. args: its `Args`. weights_scale: of the heads, which hardly depend on anything at first.
+    """
+
+    obs_shape = (ENTRIES,)
+
+    def __init__(self, script: ModuleType, args: Any, weights_scale: float = 3.0):
+        self.script, self.args, self.nvec = script, args, [3, 2]
+        self.space = gym.spaces.Dict({"observation": gym.spaces.Box(-float("inf"), float("inf"), self.obs_shape)})
+        self.agent = script.Agent(self.space, self.nvec, args)
+        with torch.no_grad():
+            for parameter in self.agent.heads.parameters():
+                parameter.mul_(weights_scale)
+
+    def initial(self, lanes: int) -> dict[str, Tensor]:
+        """Return what `Memory.initial` does."""
+        return self.agent.memory.initial(lanes, torch.device("cpu"))
+
+    def act(self, obs: Tensor, state: dict[str, Tensor], begins: Tensor) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """Take a step in a rollout of its own."""
+        outputs, values, state, _ = self.rollout(obs[None], begins[None], state)
+        return outputs[0], values[0], state
+
+    def rollout(self, obs: Tensor, begins: Tensor, state: dict[str, Tensor]) -> tuple[Tensor, Tensor, Any, Any]:
+        """Act as `collect` does; the update needs the memory's state at the end."""
+        memory, outputs, values = self.agent.memory, [], []
+        rollout = memory.begin_rollout(state, len(obs))
+        for now, begin in zip(obs, begins, strict=True):
+            memory.reset(rollout, begin)
+            x, hidden = memory.step(rollout, self.agent.encoder({"observation": now}))
+            memory.advance(rollout, hidden)
+            output, value = self.heads(x)
+            outputs.append(output)
+            values.append(value)
+        return torch.stack(outputs), torch.stack(values), memory.carry(rollout), rollout
+
+    def evaluate(self, obs: Tensor, begins: Tensor, stored: Any) -> tuple[Tensor, Tensor]:
+        """Compute all pieces of the rollout as a minibatch."""
+        done = torch.cat([begins[1:], torch.zeros_like(begins[:1])])
+        pieces = self.agent.memory.cut(done)
+        index = pieces.flat_index()
+        x = self.agent.encoder({"observation": obs.flatten(0, 1)[index]})
+        outputs, values = self.heads(self.agent.memory.unroll(stored, x, pieces))
+        back = index.argsort()
+        return outputs[back].unflatten(0, begins.shape), values[back].unflatten(0, begins.shape)
+
+    def value(self, obs: Tensor, state: dict[str, Tensor]) -> Tensor:
+        """Return what `Agent.get_value` does."""
+        return self.agent.get_value({"observation": obs}, self.agent.memory.begin_rollout(state, 1))
+
+    def reloaded(self) -> ScriptAdapter:
+        """Load the weights into a new agent."""
+        other = type(self)(self.script, self.args)
+        other.agent.load_state_dict(saved(self.agent))
+        return other
+
+    def heads(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return logits (B, P) and values (B,)."""
+        policy, values, _ = self.agent.heads(x, {})
+        return torch.cat([branch.logits for branch in policy], -1), values
+
+
+class SB3Adapter(Adapter):
+    """A recurrent policy of sb3-contrib that observes a vector and takes one discrete action, as `RecurrentPPO.policy`.
+
+    The update's batch is that of its `RecurrentRolloutBuffer`: lane after lane, each with the state of its first step.
+    """
+
+    def __init__(self, policy: Any):
+        self.policy, self.obs_shape = policy.set_training_mode(False) or policy, policy.observation_space.shape
+
+    def initial(self, lanes: int) -> Any:
+        """Return zeros for actor and critic: hidden and cell states (layers, N, D)."""
+        lstm = self.policy.lstm_actor
+        zeros = torch.zeros(lstm.num_layers, lanes, lstm.hidden_size)
+        return [[zeros, zeros], [zeros, zeros]]  # lists, since the check copies states
+
+    def act(self, obs: Tensor, state: Any, begins: Tensor) -> tuple[Tensor, Tensor, Any]:
+        """Take a step as `forward` does."""
+        outputs, values, state = self.run(obs, begins, state)
+        return outputs, values, state
+
+    def evaluate(self, obs: Tensor, begins: Tensor, stored: Any) -> tuple[Tensor, Tensor]:
+        """Compute whole lanes."""
+        flat_obs, flat_begins = obs.transpose(0, 1).flatten(0, 1), begins.T.flatten()
+        outputs, values, _ = self.run(flat_obs, flat_begins, stored[0])
+        lanes = begins.shape[::-1]
+        return outputs.unflatten(0, lanes).transpose(0, 1), values.unflatten(0, lanes).T
+
+    def value(self, obs: Tensor, state: Any) -> Tensor:
+        """Return what `predict_values` does."""
+        return self.policy.predict_values(obs, tuple(state[1]), torch.zeros(len(obs)))[:, 0]
+
+    def reloaded(self) -> SB3Adapter:
+        """Load the weights into a copy with others."""
+        other = copy.deepcopy(self.policy)
+        with torch.no_grad():
+            for parameter in other.parameters():
+                parameter.zero_()
+        other.load_state_dict(saved(self.policy))
+        return type(self)(other)
+
+    def run(self, obs: Tensor, begins: Tensor, state: Any) -> tuple[Tensor, Tensor, Any]:
+        """Run actor and critic over steps (B, ...), which are of as many lanes as the state has."""
+        policy, (actor, critic) = self.policy, state
+        features = policy.extract_features(obs)
+        pi, vf = features if isinstance(features, tuple) else (features, features)
+        starts = begins.float()
+        latent, actor = policy._process_sequence(pi, tuple(actor), starts, policy.lstm_actor)
+        if policy.lstm_critic is not None:
+            latent_vf, critic = policy._process_sequence(vf, tuple(critic), starts, policy.lstm_critic)
+        elif policy.shared_lstm:
+            latent_vf, critic = latent.detach(), actor
+        else:
+            latent_vf = policy.critic(vf)
+        logits = policy.action_net(policy.mlp_extractor.forward_actor(latent))
+        values = policy.value_net(policy.mlp_extractor.forward_critic(latent_vf))[:, 0]
+        return logits, values, [list(actor), list(critic)]
+
+
+def saved(module: torch.nn.Module) -> dict[str, Tensor]:
+    """Return the module's weights after they were written to a file and read."""
+    file = io.BytesIO()
+    torch.save(module.state_dict(), file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)

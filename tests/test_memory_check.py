@@ -1,0 +1,281 @@
+"""ppo_utils/memory_check.py: it names what is wrong in small wrong agents, and finds nothing in right ones."""
+
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import check_memory
+from ppo_utils.memory_adapters import SB3Adapter
+from ppo_utils.memory_check import STEPS, Adapter, check
+from ppo_utils.memory_probes import DELAYS
+
+ROOT = Path(__file__).parents[1]
+
+
+class Right(Adapter):
+    """A GRU that acts step by step and learns whole lanes, without a fault."""
+
+    obs_shape = (5,)
+    reach = STEPS
+
+    def __init__(self):
+        self.cell, self.head = nn.GRUCell(5, 8), nn.Linear(8, 4)
+        for parameter in self.head.parameters():
+            nn.init.normal_(parameter)
+
+    def initial(self, lanes):
+        return torch.zeros(lanes, 8)
+
+    def forget(self, state, begins):
+        return torch.where(begins[:, None], 0.0, state)
+
+    def act(self, obs, state, begins):
+        state = self.cell(obs, self.forget(state, begins))
+        return *self.heads(state), state
+
+    def heads(self, hidden):
+        out = self.head(hidden)
+        return out[..., :3], out[..., 3]
+
+    def evaluate(self, obs, begins, stored):
+        return self.unroll(obs, begins, stored[0])
+
+    def unroll(self, obs, begins, state):
+        hidden = []
+        for now, begin in zip(obs, begins, strict=True):
+            state = self.cell(now, self.forget(state, begin))
+            hidden.append(state)
+        return self.heads(torch.stack(hidden))
+
+    def value(self, obs, state):
+        return self.heads(self.cell(obs, state))[1]
+
+    def reloaded(self):
+        other = type(self)()
+        other.cell.load_state_dict(self.cell.state_dict())
+        other.head.load_state_dict(self.head.state_dict())
+        return other
+
+
+class LateReset(Right):  # as PufferLib #622
+    def evaluate(self, obs, begins, stored):
+        return self.unroll(obs, torch.cat([torch.zeros_like(begins[:1]), begins[:-1]]), stored[0])
+
+
+class EarlyReset(Right):  # as JaxMARL #119: the done flag of the step itself, not of the one before
+    def evaluate(self, obs, begins, stored):
+        return self.unroll(obs, torch.cat([begins[1:], torch.zeros_like(begins[:1])]), stored[0])
+
+
+class NoResetWhileActing(Right):  # as IsaacLab #3837
+    def act(self, obs, state, begins):
+        state = self.cell(obs, state)
+        return *self.heads(state), state
+
+
+class NoResetAtAll(NoResetWhileActing):
+    def evaluate(self, obs, begins, stored):
+        return self.unroll(obs, torch.zeros_like(begins), stored[0])
+
+
+class FreshSequences(Right):  # as ray #2898: sequences of the update begin with zeros
+    def evaluate(self, obs, begins, stored):
+        return self.unroll(obs, begins, torch.zeros_like(stored[0]))
+
+
+class PaddedInFront(Right):  # as ml-agents #5206: the stored state goes through padding first
+    def evaluate(self, obs, begins, stored):
+        return self.unroll(obs, begins, self.cell(torch.zeros_like(obs[0]), stored[0]))
+
+
+class ResetOfAllLanes(Right):  # as IsaacLab #888
+    def forget(self, state, begins):
+        return state * 0 if begins.any() else state
+
+
+class TimeAndLanesMixedUp(Right):
+    def evaluate(self, obs, begins, stored):
+        mixed = obs.flatten(0, 1).unflatten(0, obs.shape[1::-1]).transpose(0, 1)
+        return self.unroll(mixed, begins, stored[0])
+
+
+class StatisticsOverLanes(Right):
+    def heads(self, hidden):
+        return super().heads(hidden - hidden.mean(-2, keepdim=True))
+
+
+class LeakingGradient(Right):  # values are right, since the state before is subtracted again
+    def forget(self, state, begins):
+        return state - torch.where(begins[:, None], state.detach(), 0.0)
+
+
+class CutGradient(Right):
+    def unroll(self, obs, begins, state):
+        hidden = []
+        for now, begin in zip(obs, begins, strict=True):
+            state = self.cell(now, self.forget(state, begin).detach())
+            hidden.append(state)
+        return self.heads(torch.stack(hidden))
+
+
+class MemoryOfItsOwn(Right):
+    kept = None
+
+    def act(self, obs, state, begins):
+        if self.kept is None or len(self.kept) != len(obs):
+            self.kept = torch.zeros_like(state)
+        self.kept = self.cell(obs, self.forget(self.kept, begins))
+        return *self.heads(self.kept), self.kept
+
+
+class LostState(Right):
+    def rollout(self, obs, begins, state):
+        outputs, values, state, stored = super().rollout(obs, begins, state)
+        return outputs, values, torch.zeros_like(state), stored
+
+
+class ValueAfterReset(Right):
+    def value(self, obs, state):
+        return self.heads(self.cell(obs, torch.zeros_like(state)))[1]
+
+
+class ValueMovesOn(Right):  # as rsl_rl #206
+    def value(self, obs, state):
+        state.copy_(self.cell(obs, state))
+        return self.heads(state)[1]
+
+
+class HalfSaved(Right):
+    def reloaded(self):
+        other = super().reloaded()
+        nn.init.normal_(other.head.bias)
+        return other
+
+
+class NoMemory(Right):
+    def initial(self, lanes):
+        return torch.zeros(lanes, 8)
+
+    def act(self, obs, state, begins):
+        return *self.heads(self.cell(obs, state)), state
+
+    def unroll(self, obs, begins, state):
+        return self.heads(torch.stack([self.cell(now, state) for now in obs]))
+
+
+FAULTS = {
+    LateReset: {"ratio one", "reset", "ends of episodes", "gradient"},
+    EarlyReset: {"ratio one"},
+    NoResetWhileActing: {"ratio one", "reset", "ends of episodes"},
+    NoResetAtAll: {"reset", "ends of episodes", "gradient"},
+    FreshSequences: {"stored state"},
+    PaddedInFront: {"stored state"},
+    ResetOfAllLanes: {"lanes"},
+    TimeAndLanesMixedUp: {"ratio one", "lanes"},
+    StatisticsOverLanes: {"lanes"},
+    LeakingGradient: {"gradient"},
+    CutGradient: {"gradient"},
+    MemoryOfItsOwn: {"evaluation"},
+    LostState: {"next rollout"},
+    ValueAfterReset: {"time limit"},
+    ValueMovesOn: {"time limit"},
+    HalfSaved: {"saving"},
+    NoMemory: {"memory"},
+}
+
+
+@pytest.fixture
+def seeded():
+    torch.manual_seed(0)
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_faults_are_named(kind, seeded):
+    report = check(kind())
+    assert FAULTS[kind] <= {finding.check for finding in report.failed}, str(report)
+
+
+def test_a_right_agent_has_no_fault(seeded):
+    report = check(Right())
+    assert not report.failed, str(report)
+    assert report.gradient_reach == STEPS - 1
+    assert report.dependence[0] > report.dependence[8] > 0
+
+
+def test_what_a_report_says(seeded):
+    text = str(check(LateReset()))
+    assert "FAULT ratio one: the update computes something else (step 1, lane 0" in text
+    assert "FAULT reset: in the update, an episode's first step is not that of a fresh agent (step 7, lane 1" in text
+    assert "ok    evaluation: " in text
+    assert "gradient" in str(check(CutGradient()))
+    assert "reaches 0 steps back, not 24" in str(check(CutGradient()))
+
+
+@pytest.mark.parametrize("critic", ["own", "shared", "without memory"])
+def test_sb3_contribs_recurrent_policy_has_no_fault(critic, seeded):
+    policies = pytest.importorskip("sb3_contrib.common.recurrent.policies")
+    box, actions = gym.spaces.Box(-9, 9, (5,)), gym.spaces.Discrete(3)
+    kinds = {"shared_lstm": critic == "shared", "enable_critic_lstm": critic == "own", "lstm_hidden_size": 16}
+    policy = policies.RecurrentActorCriticPolicy(box, actions, lambda _: 1e-3, **kinds)
+    with torch.no_grad():
+        policy.action_net.weight.mul_(100)
+    report = check(SB3Adapter(policy))
+    assert not report.failed, str(report)
+    assert report.gradient_reach == STEPS - 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        ("ppo_gru.py --hidden-size 16 --trunk-size 16", 0, "ok    ratio one"),
+        ("ppo_gru.py --memory none --trunk-size 16 --hidden-size 16", 1, "FAULT memory: no earlier observation"),
+    ],
+)
+def test_the_program(arguments, code, words, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["check_memory.py", *f"{ROOT}/{arguments}".split()])
+    assert check_memory.main() == code
+    assert words in capsys.readouterr().out
+
+
+def test_the_program_without_a_script(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["check_memory.py", "ppo_lru.py"])
+    with pytest.raises(ValueError, match=r"there is no ppo_lru.py; give a script of this folder, such as ppo_gru.py"):
+        check_memory.main()
+
+
+# ---- probes ----
+
+
+def returns(env_id, policy, episodes=200):
+    """The returns of episodes in which policy(observations so far, of all episodes) chooses the action."""
+    env, seen, found = gym.make(env_id), [], []
+    for episode in range(episodes):
+        obs, _ = env.reset(seed=episode)
+        total, over = 0.0, False
+        while not over:
+            seen.append(obs)
+            obs, reward, over, _, _ = env.step(policy(seen))
+            total += reward
+        seen.append(obs)
+        found.append(total)
+    return np.array(found)
+
+
+def last_bit(seen, since=0):
+    return next((int(obs.argmax()) for obs in reversed(seen[since:]) if obs.any()), 0)
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+def test_recall_needs_as_many_steps_of_memory_as_it_says(delay):
+    env_id = f"Recall-{delay}-v0"
+    assert (returns(env_id, last_bit, 40) == 1).all()
+    assert abs(returns(env_id, lambda seen: last_bit(seen, -delay), 200).mean() - 0.5) < 0.1
+
+
+def test_leak_pays_only_what_the_episode_before_tells():
+    assert returns("Leak-v0", last_bit)[1:].all()
+    assert abs(returns("Leak-v0", lambda seen: 0).mean() - 0.5) < 0.1
