@@ -1,4 +1,4 @@
-"""Adapters of `memory_check` for agents that are at hand: this project's scripts, and Stable-Baselines3's."""
+"""Adapters of `memory_check`: for the agents of this project's scripts, sb3-contrib, CleanRL and TorchRL."""
 
 from __future__ import annotations
 
@@ -136,6 +136,77 @@ class SB3Adapter(Adapter):
         logits = policy.action_net(policy.mlp_extractor.forward_actor(latent))
         values = policy.value_net(policy.mlp_extractor.forward_critic(latent_vf))[:, 0]
         return logits, values, [list(actor), list(critic)]
+
+
+class CleanRLAdapter(Adapter):
+    """The `Agent` of CleanRL's `ppo_atari_lstm.py`, or of a script like it: `get_states`, `actor` and `critic`."""
+
+    def __init__(self, agent: torch.nn.Module, obs_shape: tuple[int, ...]):
+        self.agent, self.obs_shape = agent, obs_shape
+
+    def initial(self, lanes: int) -> list[Tensor]:
+        """Return zeros, hidden and cell state (layers, N, D)."""
+        lstm = self.agent.lstm
+        return [torch.zeros(lstm.num_layers, lanes, lstm.hidden_size) for _ in range(2)]
+
+    def act(self, obs: Tensor, state: list[Tensor], begins: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Take a step as `get_action_and_value` does."""
+        hidden, state = self.agent.get_states(obs, tuple(state), begins.float())
+        return self.agent.actor(hidden), self.agent.critic(hidden)[:, 0], list(state)
+
+    def evaluate(self, obs: Tensor, begins: Tensor, stored: Any) -> tuple[Tensor, Tensor]:
+        """Compute all lanes as one minibatch, step after step."""
+        outputs, values, _ = self.act(obs.flatten(0, 1), stored[0], begins.flatten())
+        return outputs.unflatten(0, begins.shape), values.unflatten(0, begins.shape)
+
+    def value(self, obs: Tensor, state: list[Tensor]) -> Tensor:
+        """Return what `get_value` does in the middle of episodes."""
+        return self.agent.get_value(obs, tuple(state), torch.zeros(len(obs)))[:, 0]
+
+
+class TorchRLAdapter(Adapter):
+    """TorchRL's `LSTMModule` or `GRUModule` that reads `obs`, its states and `is_init`, and writes `y`; a head follows.
+
+    primed: where an episode begins, the data have zeros as states, as `TensorDictPrimer` writes them.
+    """
+
+    def __init__(self, module: Any, primed: bool = True):
+        self.module, self.primed, self.states = module, primed, module.in_keys[1:-1]
+        self.network = next(each for each in module.modules() if isinstance(each, torch.nn.RNNBase))
+        self.obs_shape, self.head = (self.network.input_size,), torch.nn.Linear(self.network.hidden_size, 4)
+
+    def initial(self, lanes: int) -> list[Tensor]:
+        """Return zeros (N, layers, D) for each state."""
+        return [torch.zeros(lanes, self.network.num_layers, self.network.hidden_size) for _ in self.states]
+
+    def act(self, obs: Tensor, state: list[Tensor], begins: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Take a step."""
+        data = self.run({"obs": obs, "is_init": begins[:, None], **dict(zip(self.states, state, strict=True))}, 1)
+        return *self.heads(data["y"]), [data["next", name] for name in self.states]
+
+    def evaluate(self, obs: Tensor, begins: Tensor, stored: Any) -> tuple[Tensor, Tensor]:
+        """Compute all lanes, (N, T, ...), in the recurrent mode."""
+        from torchrl.modules import set_recurrent_mode
+
+        states = [torch.stack(each, 1) for each in zip(*stored, strict=True)]  # each (N, T, layers, D)
+        if self.primed:
+            states = [each.masked_fill(begins.T[..., None, None], 0.0) for each in states]
+        data = {"obs": obs.transpose(0, 1), "is_init": begins.T[..., None]}
+        with set_recurrent_mode(True):
+            y = self.run(data | dict(zip(self.states, states, strict=True)), 2)["y"]
+        outputs, values = self.heads(y)
+        return outputs.transpose(0, 1), values.T
+
+    def run(self, data: dict[str, Tensor], batch_dims: int) -> Any:
+        """Run the module on a TensorDict of these."""
+        from tensordict import TensorDict
+
+        return self.module(TensorDict(data, data["obs"].shape[:batch_dims]))
+
+    def heads(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Return three outputs and a value."""
+        outputs = self.head(y)
+        return outputs[..., :3], outputs[..., 3]
 
 
 def saved(module: torch.nn.Module) -> dict[str, Tensor]:

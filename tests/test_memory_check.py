@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 import check_memory
-from ppo_utils.memory_adapters import SB3Adapter
+from ppo_utils.memory_adapters import CleanRLAdapter, SB3Adapter, TorchRLAdapter
 from ppo_utils.memory_check import STEPS, Adapter, check
 from ppo_utils.memory_probes import DELAYS
 
@@ -226,6 +226,42 @@ def test_sb3_contribs_recurrent_policy_has_no_fault(critic, seeded):
     report = check(SB3Adapter(policy))
     assert not report.failed, str(report)
     assert report.gradient_reach == STEPS - 1
+
+
+class LikeCleanRL(nn.Module):
+    """The methods of CleanRL's recurrent agent."""
+
+    def __init__(self):
+        super().__init__()
+        self.lstm, self.actor, self.critic = nn.LSTM(5, 8), nn.Linear(8, 3), nn.Linear(8, 1)
+
+    def get_states(self, x, state, done):
+        lanes, outputs = state[0].shape[1], []
+        for now, ended in zip(x.unflatten(0, (-1, lanes)), done.view(-1, lanes), strict=True):
+            state = tuple((1 - ended)[None, :, None] * part for part in state)
+            y, state = self.lstm(now[None], state)
+            outputs.append(y[0])
+        return torch.cat(outputs), state
+
+    def get_value(self, x, state, done):
+        return self.critic(self.get_states(x, state, done)[0])
+
+
+def test_an_agent_like_cleanrls_has_no_fault(seeded):
+    report = check(CleanRLAdapter(LikeCleanRL(), (5,)))
+    assert not report.failed, str(report)
+
+
+@pytest.mark.parametrize("kind", ["LSTMModule", "GRUModule"])
+def test_torchrls_modules_need_states_of_zeros_where_an_episode_begins(kind, seeded):
+    modules = pytest.importorskip("torchrl.modules")
+    states = ["h", "c"][: 2 if kind == "LSTMModule" else 1]
+    keys = {"in_keys": ["obs", *states], "out_keys": ["y", *(("next", name) for name in states)]}
+    module = getattr(modules, kind)(input_size=5, hidden_size=8, **keys)
+    report = check(TorchRLAdapter(module))
+    assert not report.failed, str(report)
+    faults = {finding.check for finding in check(TorchRLAdapter(module, primed=False)).failed}
+    assert faults == {"ratio one", "stored state", "reset", "ends of episodes"}
 
 
 @pytest.mark.parametrize(
