@@ -93,12 +93,11 @@ class SB3Adapter(Adapter):
         """Return zeros for actor and critic: hidden and cell states (layers, N, D)."""
         lstm = self.policy.lstm_actor
         zeros = torch.zeros(lstm.num_layers, lanes, lstm.hidden_size)
-        return [[zeros, zeros], [zeros, zeros]]  # lists, since the check copies states
+        return [[zeros, zeros], [zeros, zeros]]
 
     def act(self, obs: Tensor, state: Any, begins: Tensor) -> tuple[Tensor, Tensor, Any]:
         """Take a step as `forward` does."""
-        outputs, values, state = self.run(obs, begins, state)
-        return outputs, values, state
+        return self.run(obs, begins, state)
 
     def evaluate(self, obs: Tensor, begins: Tensor, stored: Any) -> tuple[Tensor, Tensor]:
         """Compute whole lanes."""

@@ -167,6 +167,41 @@ class NoMemory(Right):
         return self.heads(torch.stack([self.cell(now, state) for now in obs]))
 
 
+class ResetOfTheFirstOfTwo(Right):
+    """An episode of one step is followed by another that begins: only the first is seen."""
+
+    def evaluate(self, obs, begins, stored):
+        rising = begins & ~torch.cat([torch.zeros_like(begins[:1]), begins[:-1]])
+        return super().evaluate(obs, rising, stored)
+
+
+class NoResetAtTheBorder(Right):
+    def rollout(self, obs, begins, state):
+        within = begins.clone()
+        within[0] = False
+        return super().rollout(obs, within, state)
+
+
+class CutGradientOfThePolicy(Right):
+    def unroll(self, obs, begins, state):
+        outputs, _ = CutGradient.unroll(self, obs, begins, state)
+        return outputs, super().unroll(obs, begins, state)[1]
+
+
+class NoGradient(Right):
+    @torch.no_grad()
+    def evaluate(self, obs, begins, stored):
+        return super().evaluate(obs, begins, stored)
+
+
+class FaintPolicy(NoResetAtAll):
+    """The same fault where values are a thousand times as large as what the policy does."""
+
+    def heads(self, hidden):
+        outputs, values = super().heads(hidden)
+        return 0.01 * outputs, 300 + 10 * values.detach() * 0
+
+
 FAULTS = {
     LateReset: {"ratio one", "reset", "ends of episodes", "gradient"},
     EarlyReset: {"ratio one"},
@@ -185,7 +220,85 @@ FAULTS = {
     ValueMovesOn: {"time limit"},
     HalfSaved: {"saving"},
     NoMemory: {"memory"},
+    ResetOfTheFirstOfTwo: {"reset"},
+    NoResetAtTheBorder: {"next rollout"},
+    CutGradientOfThePolicy: {"gradient"},
+    NoGradient: {"gradient"},
+    FaintPolicy: {"reset", "ends of episodes"},
 }
+
+
+class LearnedStart(Right):
+    def __init__(self):
+        super().__init__()
+        self.start = nn.Parameter(torch.randn(8))
+
+    def initial(self, lanes):
+        return self.start.expand(lanes, -1)
+
+    def forget(self, state, begins):
+        return torch.where(begins[:, None], self.start, state)
+
+    reloaded = Adapter.reloaded
+
+
+class Codes(Right):
+    """Observes an integer."""
+
+    obs_shape = ()
+
+    def __init__(self):
+        super().__init__()
+        self.table = nn.Embedding(7, 5)
+
+    def observations(self, steps, lanes):
+        return torch.randint(7, (steps, lanes))
+
+    def act(self, obs, state, begins):
+        return super().act(self.table(obs), state, begins)
+
+    def unroll(self, obs, begins, state):
+        return super().unroll(self.table(obs), begins, state)
+
+    def value(self, obs, state):
+        return super().value(self.table(obs), state)
+
+    reloaded = Adapter.reloaded
+
+
+class MaskedAction(Right):
+    def heads(self, hidden):
+        outputs, values = super().heads(hidden)
+        return torch.cat([outputs, torch.full_like(values, -torch.inf)[..., None]], -1), 1000 + 0.01 * values
+
+
+class ThreeStepsAgo(Right):
+    """Remembers the observation of three steps ago, and no other."""
+
+    reach = 3
+
+    def initial(self, lanes):
+        return torch.zeros(lanes, 4, 5)
+
+    def forget(self, state, begins):
+        return state * ~begins[:, None, None]
+
+    def act(self, obs, state, begins):
+        state = torch.cat([self.forget(state, begins)[:, 1:], obs[:, None]], 1)
+        return *self.seen(state), state
+
+    def seen(self, state):
+        return self.heads(torch.tanh(state[:, 0]).repeat(1, 2)[:, :8])
+
+    def unroll(self, obs, begins, state):
+        found = []
+        for now, begin in zip(obs, begins, strict=True):
+            state = torch.cat([self.forget(state, begin)[:, 1:], now[:, None]], 1)
+            found.append(self.seen(state))
+        return tuple(torch.stack(each) for each in zip(*found, strict=True))
+
+    def value(self, obs, state):
+        return self.seen(torch.cat([state[:, 1:], obs[:, None]], 1))[1]
 
 
 @pytest.fixture
@@ -199,9 +312,21 @@ def test_faults_are_named(kind, seeded):
     assert FAULTS[kind] <= {finding.check for finding in report.failed}, str(report)
 
 
-def test_a_right_agent_has_no_fault(seeded):
-    report = check(Right())
+@pytest.mark.parametrize("kind", [Right, LearnedStart, Codes, MaskedAction, ThreeStepsAgo])
+def test_right_agents_have_no_fault(kind, seeded):
+    report = check(kind())
     assert not report.failed, str(report)
+
+
+def test_wrong_shapes_are_told(seeded):
+    agent = Right()
+    agent.heads = lambda hidden: (hidden, hidden[..., :1])
+    with pytest.raises(ValueError, match=r"outputs \(24, 4, 8\) need values \(24, 4\), not \(24, 4, 1\)"):
+        check(agent)
+
+
+def test_how_much_is_remembered(seeded):
+    report = check(Right())
     assert report.gradient_reach == STEPS - 1
     assert report.dependence[0] > report.dependence[8] > 0
 
@@ -212,7 +337,7 @@ def test_what_a_report_says(seeded):
     assert "FAULT reset: in the update, an episode's first step is not that of a fresh agent (step 7, lane 1" in text
     assert "ok    evaluation: " in text
     assert "gradient" in str(check(CutGradient()))
-    assert "reaches 0 steps back, not 24" in str(check(CutGradient()))
+    assert "reaches 0 steps back in lane 0, not 23" in str(check(CutGradient()))
 
 
 @pytest.mark.parametrize("critic", ["own", "shared", "without memory"])
