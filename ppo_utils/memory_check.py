@@ -236,38 +236,39 @@ def gradients_stay(case: Case) -> Finding | None:
     outputs, wanted = case.evaluate(obs, stored=case.stored), case.adapter.reach
     if not obs.requires_grad:
         return None
-    if (
-        not outputs.requires_grad
-        or torch.autograd.grad(outputs.sum(), obs, retain_graph=True, allow_unused=True)[0] is None
-    ):
+    if not outputs.requires_grad or gradient(outputs.sum(), obs) is None:
         return Finding("gradient", False, "the update has no gradient to any observation") if wanted else None
-    steps, reaches = episode_steps(case.begins), [0] * LANES
     weights = torch.randn(outputs.shape[-1])
-    around_starts = {step + near for step, _ in STARTS for near in (-1, 0, 1)}
     for lane in range(LANES):
-        for step in range(STEPS):
-            if lane and step not in around_starts:
-                continue  # of one lane all steps, of the others those that a fault would show at
-            policy, both = (
-                torch.autograd.grad((outputs[step, lane] * weights)[:end].sum(), obs, retain_graph=True)[0]
-                for end in (-1, None)
-            )
-            seen = both.flatten(2).abs().sum(-1) != 0  # (T, N)
-            allowed = torch.zeros_like(seen)
-            allowed[step - int(steps[step, lane]) : step + 1, lane] = True
-            if (seen & ~allowed).any():
-                says = f"the gradient of step {step}, lane {lane} reaches the observation of {first(seen & ~allowed)}"
-                return Finding("gradient", False, f"{says}, which is of another episode or lane, or comes later")
-            (acted_on,) = (policy[:, lane].flatten(1).abs().sum(-1) != 0).nonzero(as_tuple=True)  # earlier steps
-            reaches[lane] = max(reaches[lane], step - int(acted_on.min()) if len(acted_on) else 0)
-    case.reach = max(reaches)
-    for lane, longest in enumerate(steps.amax(0).tolist()):
-        if wanted is not None and reaches[lane] != min(wanted, longest):
+        others = gradient((outputs[:, lane] * weights).sum(), obs)
+        others[:, lane] = False
+        if others.any():
             says = (
-                f"the policy's gradient reaches {reaches[lane]} steps back in lane {lane}, not {min(wanted, longest)}"
+                f"the gradient of lane {lane} reaches the observation of {first(others)}: lanes learn from each other"
             )
+            return Finding("gradient", False, says)
+    steps, reaches = episode_steps(case.begins), torch.zeros(LANES, dtype=torch.int64)
+    time = torch.arange(STEPS)[:, None]
+    for step in range(STEPS):
+        wrong = gradient((outputs[step] * weights).sum(), obs)
+        wrong &= ~((time >= step - steps[step]) & (time <= step))
+        if wrong.any():
+            says = f"the gradient of step {step} reaches the observation of {first(wrong)}, of another episode or later"
+            return Finding("gradient", False, says)
+        earlier = gradient((outputs[step] * weights)[:, :-1].sum(), obs) * (step - time)  # (T, N) how much earlier
+        reaches = torch.maximum(reaches, earlier.amax(0))
+    case.reach = int(reaches.max())
+    for lane, (reach, longest) in enumerate(zip(reaches.tolist(), steps.amax(0).tolist(), strict=True)):
+        if wanted is not None and reach != min(wanted, longest):
+            says = f"the policy's gradient reaches {reach} steps back in lane {lane}, not {min(wanted, longest)}"
             return Finding("gradient", False, f"{says}: what is further away is hardly learned")
     return Finding("gradient", True, "none crosses the end of an episode or reaches another lane")
+
+
+def gradient(output: Tensor, obs: Tensor) -> Tensor | None:
+    """(T, N) bool: which observations (T, N, ...) the output has a gradient to; None: it depends on none."""
+    (found,) = torch.autograd.grad(output, obs, retain_graph=True, allow_unused=True)
+    return None if found is None else found.flatten(2).abs().sum(-1) != 0
 
 
 def keeps_lanes_apart(case: Case) -> Finding:
