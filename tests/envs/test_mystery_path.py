@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from memory_gym_envs import MysteryPath
+from memory_gym_envs import EASY_MYSTERY_PATH, MysteryPath
 from memory_gym_envs.character import BODY, PAD
 from memory_gym_envs.mystery_path.levels import FIRST_SEGMENTS, read_ahead, sample_segments
 from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE
@@ -201,6 +201,21 @@ def test_what_shows_of_an_agent_above_the_screen(scale, left):
     vectors = gym.make_vec(ENDLESS, num_envs=1, obs_type="vector")
     vectors.reset(seed=11, options=options)
     assert bool(vectors.step([2])[0][0, 0]) == (left > 0)
+
+
+@FINITE
+def test_the_easy_task_shows_both_ends_and_pays_for_tiles(env_id):
+    env = gym.make(env_id, options=EASY_MYSTERY_PATH).unwrapped
+    frame, _ = env.reset(seed=3)
+    assert has(frame, BLUE)
+    assert has(frame, GREEN)
+    rewards, over = [], False
+    while not over:
+        _, reward, over, _, info = env.step(player(env.batch)[0])
+        rewards.append(round(reward, 6))
+    between = len(path_of(env.batch.state)) - 2
+    assert sorted(rewards)[-between - 1 :] == [0.1] * between + [1.0]
+    assert info["reward"] == pytest.approx(0.1 * between + 1)
 
 
 # ---- endless episodes ----
