@@ -5,9 +5,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-import sb3_contrib.common.recurrent.policies as sb3_policies
 import torch
-import torchrl.modules
 from torch import nn
 
 import check_memory
@@ -343,9 +341,10 @@ def test_what_a_report_says(seeded):
 
 @pytest.mark.parametrize("critic", ["own", "shared", "without memory"])
 def test_sb3_contribs_recurrent_policy_has_no_fault(critic, seeded):
+    policies = pytest.importorskip("sb3_contrib.common.recurrent.policies")
     box, actions = gym.spaces.Box(-9, 9, (5,)), gym.spaces.Discrete(3)
     kinds = {"shared_lstm": critic == "shared", "enable_critic_lstm": critic == "own", "lstm_hidden_size": 16}
-    policy = sb3_policies.RecurrentActorCriticPolicy(box, actions, lambda _: 1e-3, **kinds)
+    policy = policies.RecurrentActorCriticPolicy(box, actions, lambda _: 1e-3, **kinds)
     with torch.no_grad():
         policy.action_net.weight.mul_(100)
     report = check(SB3Adapter(policy))
@@ -379,9 +378,10 @@ def test_an_agent_like_cleanrls_has_no_fault(seeded):
 
 @pytest.mark.parametrize("kind", ["LSTMModule", "GRUModule"])
 def test_torchrls_modules_need_states_of_zeros_where_an_episode_begins(kind, seeded):
+    modules = pytest.importorskip("torchrl.modules")
     states = ["h", "c"][: 2 if kind == "LSTMModule" else 1]
     keys = {"in_keys": ["obs", *states], "out_keys": ["y", *(("next", name) for name in states)]}
-    module = getattr(torchrl.modules, kind)(input_size=5, hidden_size=8, **keys)
+    module = getattr(modules, kind)(input_size=5, hidden_size=8, **keys)
     report = check(TorchRLAdapter(module))
     assert not report.failed, str(report)
     faults = {finding.check for finding in check(TorchRLAdapter(module, primed=False)).failed}
