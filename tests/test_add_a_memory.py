@@ -46,13 +46,16 @@ def test_the_memory_of_the_page(tmp_path):
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
+    def train_and_evaluate():
+        few = ["--seeds", "1", "--steps", "3e3", "--evaluations", "1", "--test-levels", "5"]
+        tasks = ("--tasks", "mortar-mayhem", "--agents", "ppo_mingru.py --num-envs 16")
+        command(tmp_path / "benchmarks/learning.py", *tasks, *few)()
+        (model,) = tmp_path.glob("learning/runs/*/model.pt")
+        command(tmp_path / "evaluate.py", model, "--levels", "1", "--repeats", "1")()
+
     files = ["tests/test_memory.py", "tests/test_resume.py"]
     tests = said(lambda: sys.exit(pytest.main(["-p", "no:cacheprovider", *files, "-k", "mingru"])))
     assert int(re.search(r"(\d+) passed", tests).group(1)) >= 19
-
-    few = ["--seeds", "1", "--steps", "3e3", "--evaluations", "1", "--test-levels", "5"]
-    tasks = ("--tasks", "mortar-mayhem", "--agents", "ppo_mingru.py --num-envs 16")
-    assert "\n| ppo_mingru.py, num envs 16 | 0." in said(command(tmp_path / "benchmarks/learning.py", *tasks, *few))
-    (model,) = tmp_path.glob("learning/runs/*/model.pt")
-    scores = said(command(tmp_path / "evaluate.py", model, "--levels", "1", "--repeats", "1"))
+    scores = said(train_and_evaluate)
+    assert "\n| ppo_mingru.py, num envs 16 | 0." in scores
     assert "| ppo_mingru-py-num-envs-16 | 1 |" in scores

@@ -6,10 +6,6 @@ import os
 import random
 import re
 import signal
-import subprocess
-import sys
-import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -55,10 +51,6 @@ for name, args, weights, rollout in torch.load("given.pt", weights_only=False):
 torch.save(updated, f"updated{rank}.pt")
 close(run)
 """
-
-
-def torchrun(*command):
-    return [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", *command]
 
 
 def train_together(path, *flags):
@@ -238,19 +230,15 @@ def workers(process):
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the processes in /proc")
 def test_a_signal_to_torchrun(curves):
     """As a cluster sends it: to torchrun, which passes it on, and perhaps to all processes too."""
-    process = subprocess.Popen(torchrun(*ENDLESS), stderr=subprocess.PIPE, text=True, start_new_session=True)
-    deadline = threading.Timer(300, process.kill)
-    deadline.start()
-    while not has_checkpoint():
-        assert process.poll() is None
-        time.sleep(0.1)
-    for each in [*workers(process), process.pid]:
-        os.kill(each, signal.SIGTERM)
-    said = process.communicate()[1]
-    deadline.cancel()
-    assert process.returncode == 1, "torchrun's own"
-    assert "another process of this run has ended" not in said
-    assert "stopping at the end of this iteration" in said
+    launch = programs.module("torch.distributed.run", "--standalone", "--nproc-per-node=2", *ENDLESS)
+    with programs.Program(launch) as process:
+        process.wait_until(has_checkpoint)
+        for each in [*workers(process), process.pid]:
+            os.kill(each, signal.SIGTERM)
+        done = process.wait()
+    assert done.returncode == 1, "torchrun's own"
+    assert "another process of this run has ended" not in done.stderr
+    assert "stopping at the end of this iteration" in done.stderr
     (folder,) = Path("runs").iterdir()
     assert read_checkpoint(folder)["step"] == curves(folder)["losses/loss"][-1][0]
 
