@@ -96,9 +96,9 @@ def code_of(page):
 
 
 @pytest.mark.parametrize(("script", "changes"), [
-    (ppo_gru, {"num_layers": 2}), (ppo_gru, {"memory": "lstm"}), (ppo_trxl, {"trxl_query_position": True}),
-    (ppo_trxl, {"trxl_positional_encoding": "relative"}),
-    (ppo_trxl, {"trxl_positional_encoding": "learned", "trxl_gate": "gru", "trxl_layer_norm": "post"}),
+    (ppo_gru, {"num_layers": 2}), (ppo_gru, {"memory": "lstm"}),
+    (ppo_trxl, {"trxl_positional_encoding": "learned", "trxl_query_position": True}),
+    (ppo_trxl, {"trxl_positional_encoding": "relative", "trxl_gate": "gru", "trxl_layer_norm": "post"}),
 ])  # fmt: skip
 def test_a_step_is_exported_as_documented(trained, script, changes, monkeypatch):
     """Over 20 steps of two episodes, a window of 7 included: the agent's own logits and values, to 1e-6."""

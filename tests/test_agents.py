@@ -26,11 +26,15 @@ def test_the_table_has_all_agents():
 @pytest.mark.parametrize(("name", "metric", "score", "flags"), ROWS, ids=[row[0] for row in ROWS])
 def test_an_agent_plays_as_well_as_published(name, metric, score, flags):
     checkpoint = evaluate.Checkpoint.read(str(AGENTS / name))
-    few = 30 if "endless" in name else 150  # of the 1,000 test levels; endless episodes are long
+    few = 20 if "endless" in name else 75  # of the 1,000 test levels; endless episodes are long
     levels = evaluate.Config(start_level=learning.FIRST_TEST_LEVEL, levels=few, repeats=1)
     scores = evaluate.play(checkpoint, levels)[metric]  # (M, E)
-    # Within four standard errors of fewer levels and, with other roundings, other actions.
-    assert scores.mean() == pytest.approx(float(score), abs=0.005 + 4 * scores.std() / scores.size**0.5)
+    # Within four standard errors of fewer levels and, with other roundings, other actions. Where all of them have a
+    # score of 1, their own deviation tells nothing.
+    published = float(score)
+    least = (published * (1 - published)) ** 0.5 if 0.9 < published <= 1 else 0
+    error = max(scores.std(), least) / scores.size**0.5
+    assert scores.mean() == pytest.approx(published, abs=0.005 + 4 * error)
 
     (planned,) = learning.plans_of(tyro.cli(learning.Config, args=shlex.split(flags))).values()
     assert asdict(planned.args) == asdict(checkpoint.args)

@@ -759,7 +759,7 @@ def test_numbers_as_names_of_actions(browser, saved, tmp_path):
     assert [each.text for each in browser.find_elements("css selector", "#bars .xtick")] == ["0", "1"]
 
 
-@pytest.mark.parametrize("width", [1920, 1280, 700, 400])
+@pytest.mark.parametrize("width", [1920, 700, 400])
 def test_every_width(width, browser, watch):
     """Nothing is wider than its card: if the window has this width, comes to have it, or the page becomes narrower."""
     wide = """const right = element => element.getBoundingClientRect().right;
