@@ -163,6 +163,79 @@ class CleanRLAdapter(Adapter):
         return self.agent.get_value(obs, tuple(state), torch.zeros(len(obs)))[:, 0]
 
 
+class CleanRLTrXLAdapter(Adapter):
+    """The `Agent` of CleanRL's `ppo_trxl.py`, with the memories, windows and masks that its main program gives to it.
+
+    length: `--trxl-memory-length`. The agent's longest episode must have more than 48 steps.
+    """
+
+    def __init__(self, agent: torch.nn.Module, length: int):
+        self.agent, self.length, self.obs_shape = agent, length, tuple(agent.obs_shape)
+        if agent.max_episode_steps <= 48:
+            raise ValueError(f"max_episode_steps is {agent.max_episode_steps}; make the agent with more than 48")
+
+    def initial(self, lanes: int) -> dict[str, Tensor]:
+        """Return empty memories (N, steps, layers, D) and steps (N,) of episodes."""
+        transformer = self.agent.transformer
+        layers, dim = len(transformer.transformer_layers), self.agent.critic.in_features
+        memory = torch.zeros(lanes, self.agent.max_episode_steps, layers, dim)
+        return {"memory": memory, "step": torch.zeros(lanes, dtype=torch.int64)}
+
+    def act(self, obs: Tensor, state: dict[str, Tensor], begins: Tensor) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """Take a step, and write what the blocks were given into the memory."""
+        memory, step = state["memory"].clone(), torch.where(begins, 0, state["step"])
+        memory[begins] = 0.0
+        outputs, values, given = self.run(obs, memory, step)
+        memory[torch.arange(len(obs)), step] = given
+        return outputs, values, {"memory": memory, "step": step + 1}
+
+    def rollout(self, obs: Tensor, begins: Tensor, state: dict[str, Tensor]) -> tuple[Tensor, Tensor, Any, Any]:
+        """Act; the update needs the memory after each step, and each step's place in its episode."""
+        outputs, values, after = [], [], []
+        for now, begin in zip(obs, begins, strict=True):
+            output, value, state = self.act(now, state, begin)
+            outputs.append(output)
+            values.append(value)
+            after.append(state)
+        stored = {name: torch.stack([each[name] for each in after]) for name in state}
+        return torch.stack(outputs), torch.stack(values), state, stored
+
+    def evaluate(self, obs: Tensor, begins: Tensor, stored: Any) -> tuple[Tensor, Tensor]:
+        """Compute all steps as a minibatch, each with its window of its episode's memory as it was at the end."""
+        steps, lanes = begins.shape
+        last = torch.full_like(stored["step"], steps - 1)  # step of each one's episode in this rollout
+        for t in reversed(range(steps - 1)):
+            last[t] = torch.where(begins[t + 1], t, last[t + 1])
+        memories = stored["memory"][last, torch.arange(lanes)].flatten(0, 1)
+        outputs, values, _ = self.run(obs.flatten(0, 1), memories, stored["step"].flatten() - 1)
+        return outputs.unflatten(0, begins.shape), values.unflatten(0, begins.shape)
+
+    def value(self, obs: Tensor, state: dict[str, Tensor]) -> Tensor:
+        """Return what the main program bootstraps from."""
+        first = (state["step"] - self.length).clamp(min=0)
+        window = first[:, None] + torch.arange(self.length)
+        mask, positions = self.mask(state["step"]), self.window(state["step"] - 1)
+        return self.agent.get_value(obs, self.select(state["memory"], window), mask, positions)
+
+    def run(self, obs: Tensor, memory: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Compute steps (B,) of episodes with these memories: logits, values and what the blocks were given."""
+        window = self.window(step)
+        *_, values, given = self.agent.get_action_and_value(obs, self.select(memory, window), self.mask(step), window)
+        return torch.cat([branch(self.agent.x) for branch in self.agent.actor_branches], -1), values, given
+
+    def window(self, step: Tensor) -> Tensor:
+        """(B, length) the steps of the episode that a window shows."""
+        return (step - self.length + 1).clamp(min=0)[:, None] + torch.arange(self.length)
+
+    def mask(self, step: Tensor) -> Tensor:
+        """(B, length) which of them are over."""
+        return torch.arange(self.length) < step.clamp(max=self.length - 1)[:, None]
+
+    def select(self, memory: Tensor, window: Tensor) -> Tensor:
+        """(B, length, layers, D) the memory's entries in a window."""
+        return memory[torch.arange(len(memory))[:, None], window]
+
+
 class TorchRLAdapter(Adapter):
     """TorchRL's `LSTMModule` or `GRUModule` that reads `obs`, its states and `is_init`, and writes `y`; a head follows.
 

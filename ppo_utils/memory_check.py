@@ -200,6 +200,8 @@ def recomputes(case: Case) -> Finding:
         later = "from the episodes' second steps on"
         if (wrong & ~inside).any():
             later = "also in episodes' first steps: dropout or statistics of a batch, maybe"
+        if not inside.any():
+            later = "only in episodes' first steps: does it hide what an empty memory holds?"
         says = f"the update computes something else ({first(wrong)}; {later}): its ratios are not one before it learns"
         says += ", so PPO clips and learns from a policy that never acted"
     return Finding("ratio one", not wrong.any(), says)
@@ -214,7 +216,7 @@ def resets(case: Case) -> Finding:
         wrong = case.differs(outputs, fresh) & case.begins
         if wrong.any():
             says = f"in {way}, an episode's first step is not that of a fresh agent ({first(wrong)}): "
-            says += "the memory is reset too late, or not at all, so an episode begins with another one's past"
+            says += "the memory is reset too late or not at all, or what an empty one holds is not hidden"
             return Finding("reset", False, says)
     return Finding("reset", True, "an episode begins as a fresh agent does, in acting and in the update")
 
@@ -313,7 +315,7 @@ def recomputes_later(case: Case) -> Finding:
     begins = torch.zeros_like(case.begins)
     begins[0, 1] = begins[STEPS // 2, 0] = True
     acted, _, stored = case.act(case.obs, begins, case.next_state)
-    wrong = case.differs(case.evaluate(case.obs, begins, stored).detach(), acted)
+    wrong = case.differs(case.evaluate(case.obs, begins, stored).detach(), acted) & ~begins
     says = "the update recomputes rollouts that begin within an episode"
     if wrong.any():
         says = f"where a rollout begins within an episode, the update computes something else ({first(wrong)}): "

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 import check_memory
-from ppo_utils.memory_adapters import CleanRLAdapter, SB3Adapter, TorchRLAdapter
+from ppo_utils.memory_adapters import CleanRLAdapter, CleanRLTrXLAdapter, SB3Adapter, TorchRLAdapter
 from ppo_utils.memory_check import STEPS, Adapter, check
 from ppo_utils.memory_probes import DELAYS
 
@@ -374,6 +374,40 @@ class LikeCleanRL(nn.Module):
 def test_an_agent_like_cleanrls_has_no_fault(seeded):
     report = check(CleanRLAdapter(LikeCleanRL(), (5,)))
     assert not report.failed, str(report)
+
+
+class LikeCleanRLsTransformer(nn.Module):
+    """The methods of CleanRL's transformer agent, whose attention weighs all steps equally that the mask leaves.
+
+    empty: what it reads where the mask leaves none: "zeros", or, as CleanRL's, the mean over "all".
+    """
+
+    def __init__(self, empty):
+        super().__init__()
+        self.obs_shape, self.max_episode_steps, self.empty = (5,), 64, empty
+        self.transformer = nn.Module()
+        self.transformer.transformer_layers = nn.ModuleList([nn.Linear(5, 5)])
+        self.actor_branches, self.critic = nn.ModuleList([nn.Linear(5, 3), nn.Linear(5, 2)]), nn.Linear(5, 1)
+
+    def get_action_and_value(self, x, memory, mask, indices):
+        hidden = mask if self.empty == "zeros" else mask | ~mask.any(1, keepdim=True)
+        weights = hidden / hidden.sum(1, keepdim=True).clamp(min=1)
+        read = (memory[:, :, 0] + torch.sin(indices)[..., None]) * weights[..., None]
+        self.x = torch.tanh(self.transformer.transformer_layers[0](x + read.sum(1)))
+        return None, None, None, self.critic(self.x)[:, 0], x.detach()[:, None]
+
+    def get_value(self, x, memory, mask, indices):
+        return self.get_action_and_value(x, memory, mask, indices)[3]
+
+
+@pytest.mark.parametrize(
+    ("empty", "faults"), [("all", {"ratio one", "reset", "time limit"}), ("zeros", {"time limit"})]
+)
+def test_what_is_wrong_in_cleanrls_transformer(empty, faults, seeded):
+    report = check(CleanRLTrXLAdapter(LikeCleanRLsTransformer(empty), 8))
+    assert {finding.check for finding in report.failed} == faults, str(report)
+    assert "only in episodes' first steps" in str(report) or empty == "zeros"
+    assert report.dependence[4] > 0 == report.dependence[16]
 
 
 @pytest.mark.parametrize("kind", ["LSTMModule", "GRUModule"])
