@@ -57,6 +57,8 @@ class Config:
     start_level: NonNegativeInt | None = None
     """the first of these levels (default: the first after those of the training; an agent that trained without a limit,
     --num-levels 0, has met none of the numbered levels)"""
+    new_levels: bool = False
+    """of these levels, play only those that begin as none of the training's does: two levels may have the same path"""
     repeats: PositiveInt = 3
     """how often to play each level"""
     max_steps: PositiveInt = 10_000
@@ -120,7 +122,7 @@ def play(checkpoint: Checkpoint, config: Config) -> dict[str, np.ndarray]:
     """
     args = checkpoint.args
     device = torch.device("cuda" if torch.cuda.is_available() and config.cuda else "cpu")
-    levels = evaluation_levels(args, config.levels, config.repeats, config.start_level)
+    levels = evaluation_levels(args, config.levels, config.repeats, config.start_level, config.new_levels)
     agent, found = None, defaultdict(lambda: np.full(len(levels), np.nan))
     for start in range(0, len(levels), AT_ONCE):
         batch = levels[start : start + AT_ONCE]
@@ -143,7 +145,11 @@ def title_of(args: dict[str, Any], config: Config) -> str:
     training = SimpleNamespace(**args)
     first = first_unseen(training) if config.start_level is None else config.start_level
     trained_on = " (of its training)" if are_trained_on(training, first, config.levels) else ""
-    levels = f"levels {first} to {first + config.levels - 1}{trained_on}, {config.repeats} times each"
+    if config.new_levels:
+        which = f"{config.levels} levels from {first} on that begin as none of the training's does"
+    else:
+        which = f"levels {first} to {first + config.levels - 1}{trained_on}"
+    levels = f"{which}, {config.repeats} times each"
     return f"{task_of(args)}, {levels}{', most probable actions' if config.deterministic else ''}"
 
 

@@ -4,6 +4,7 @@ Shape letters: N environments, one for each episode.
 """
 
 import functools
+import itertools
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,14 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
-from ppo_utils.environments import as_tensors
+from ppo_utils.environments import as_tensors, envs_for
 from ppo_utils.errors import report_unusable_policy
 from ppo_utils.flags import RunArgs
 from ppo_utils.infos import final_numbers, ground_truth_of
 from ppo_utils.terminal import tell
 
 REPEATS = 3  # times that each level is played
+AT_ONCE = 1000  # levels whose beginnings are looked at
 MEMORY_STEPS = 64  # that a memory has room for, until `with_room` makes room again
 
 
@@ -31,10 +33,50 @@ def are_trained_on(args: RunArgs, first: int, levels: int) -> bool:
     return max(first, args.start_level) < min(first + levels, first_unseen(args))
 
 
-def evaluation_levels(args: RunArgs, levels: int, repeats: int = REPEATS, first: int | None = None) -> list[int]:
-    """Return the seeds (N,) of an evaluation's levels, with repeats: from `first`, or from the first unseen one."""
+def evaluation_levels(
+    args: RunArgs, levels: int, repeats: int = REPEATS, first: int | None = None, new: bool = False
+) -> list[int]:
+    """Return the seeds (N,) of an evaluation's levels, with repeats: from `first`, or from the first unseen one.
+
+    new: only `new_levels`, which may raise ValueError.
+    """
     first = first_unseen(args) if first is None else first
-    return [level for level in range(first, first + levels) for _ in range(repeats)]
+    numbers = new_levels(args, levels, first) if new else range(first, first + levels)
+    return [level for level in numbers for _ in range(repeats)]
+
+
+def new_levels(args: RunArgs, count: int, first: int) -> list[int]:
+    """Return the first `count` levels from `first` on that begin as none of a training's levels does.
+
+    By all that `oracle()` of the Memory Gym environments tells: path, commands, coins and places. Raises ValueError for
+    other environments, for a training without a limit, and where of 1,000 levels in a row none is new.
+    """
+    if not args.num_levels:
+        raise ValueError("--new-levels: with --num-levels 0, a training may have met any level")
+    envs = envs_for(args, AT_ONCE, obs_type="vector", num_levels=0, asynchronous=False)
+    if not hasattr(envs.unwrapped, "oracle"):
+        raise ValueError(f"--new-levels: {args.env_id} does not tell what a level holds")
+
+    def beginnings(start: int, levels: int) -> list[bytes]:
+        envs.reset(seed=list(range(start, start + AT_ONCE)))
+        told = {name: part.reshape(AT_ONCE, -1) for name, part in envs.unwrapped.oracle().items() if name != "seed"}
+        # Paths and sequences are as long as the longest of these; -1 follows their end.
+        held = [[np.trim_zeros(part[lane] + 1, "b").tobytes() for part in told.values()] for lane in range(levels)]
+        return [b"|".join(parts) for parts in held]
+
+    last, found = first_unseen(args), []
+    trained_on = {
+        each for at in range(args.start_level, last, AT_ONCE) for each in beginnings(at, min(AT_ONCE, last - at))
+    }
+    for at in itertools.count(first, AT_ONCE):
+        fresh = [at + lane for lane, each in enumerate(beginnings(at, AT_ONCE)) if each not in trained_on]
+        found += fresh
+        if len(found) >= count:
+            envs.close()
+            return found[:count]
+        if not fresh:
+            raise ValueError(f"--new-levels: levels {at} to {at + AT_ONCE - 1} all begin as some of the training do")
+    raise AssertionError
 
 
 def make_agent(kind: type[nn.Module], envs: VectorEnv, infos: dict, args: RunArgs) -> nn.Module:

@@ -61,6 +61,34 @@ def test_levels_that_were_trained_on(tiny):
     assert {each: evaluation.are_trained_on(args, *each) for each in ranges} == ranges
 
 
+def test_new_levels_begin_as_none_of_the_training_s(tiny):
+    args = tiny(env_id="MysteryPath-Grid-v0", num_levels=2000, start_level=7)
+    envs = gym.make_vec(args.env_id, num_envs=2300)
+    envs.reset(seed=args.start_level)
+    s = envs.unwrapped.state
+    paths = [tuple(cells[1 : 1 + length]) for cells, length in zip(s.path_cell, s.path_length, strict=True)]
+    wanted = [7 + at for at in range(2000, 2300) if paths[at] not in set(paths[:2000])]
+    assert 50 < len(wanted) < 250
+    assert evaluation.new_levels(args, len(wanted), 2007) == wanted
+    assert evaluation_levels(args, 2, 3, new=True) == [wanted[0]] * 3 + [wanted[1]] * 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"env_id": "CartPole-v1"}, "CartPole-v1 does not tell what a level holds"),
+        ({"env_id": "MysteryPath-v0", "num_levels": 0}, "with --num-levels 0, a training may have met any level"),
+        (
+            {"env_id": "MortarMayhem-Grid-v0", "num_levels": 3000, "env_options": '{"command_count": [1]}'},
+            "levels 3000 to 3999 all begin as some of the training do",
+        ),
+    ],
+)
+def test_where_no_level_is_new(tiny, changes, words):
+    with pytest.raises(ValueError, match=words):
+        evaluation_levels(tiny(**changes), 5, new=True)
+
+
 @EACH_SCRIPT
 def test_a_lane_plays_its_level_once(played, script, monkeypatch):
     """The same actions in single environments with the levels' seeds earn the same."""

@@ -285,8 +285,9 @@ class MortarMayhem(MemoryGymVectorEnv):
         """The whole task in plain numbers, fresh arrays (N, ...). Besides `seed` and `length`:
 
         `position` (N, 2), the agent's centre in pixels, x and y; `tile` and `target_tile` (N, 2), column and row of its
-        tile and of the one that the command leads to; `command` (N,), its index in COMMANDS; `commands_left` (N,), in
-        this round, with the present one; `carried_out` (N,), in this episode.
+        tile and of the one that the command leads to; `command` (N,), its index in COMMANDS; `commands` (N, C), the
+        sequence, -1 after its end; `commands_left` (N,), in this round, with the present one; `carried_out` (N,), in
+        this episode.
         """
         s = self.state
         position, side = s.pos - PAD, s.size[:, None]
@@ -294,7 +295,8 @@ class MortarMayhem(MemoryGymVectorEnv):
         present = s.commands[np.arange(self.num_envs), np.minimum(s.current, s.count - 1)]
         numbers = {"position": position, "tile": (position - first_pixel(side)) // TILE, "target_tile": target}
         counts = {"commands_left": s.count - s.current, "carried_out": s.completed.copy()}
-        return super().oracle() | numbers | {"command": present} | counts
+        commands = np.where(np.arange(s.commands.shape[1]) < s.count[:, None], s.commands, -1)
+        return super().oracle() | numbers | {"command": present, "commands": commands} | counts
 
     def longest_episode(self, lane: int) -> int:
         """The steps after which the lane's episode is over at the latest, under its reset options; -1: no limit."""

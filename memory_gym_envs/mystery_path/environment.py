@@ -287,13 +287,16 @@ class MysteryPath(MemoryGymVectorEnv):
         """The whole task in plain numbers, fresh arrays (N, ...). Besides `seed` and `length`:
 
         `position` (N, 2), the agent's centre in pixels, x and y; `tile` (N, 2), its column and row; `next_tile` (N, 2),
-        the path's next one from where the agent last was on it; `falls` (N,); in the finite ids `goal_tile` (N, 2) and
-        `tiles_left` (N,), how many follow on the path. In the endless id, columns and x are counted along the path.
+        the path's next one from where the agent last was on it; `path` (N, P, 2), its tiles so far, -1 after the last;
+        `falls` (N,); in the finite ids `goal_tile` (N, 2) and `tiles_left` (N,), how many follow on the path. In the
+        endless id, columns and x are counted along the path.
         """
         s, lanes = self.state, np.arange(self.num_envs)
         step = np.maximum(s.last_path_step, 1)
         following = s.path_cell[lanes, np.minimum(step + 1, s.path_length)]
         numbers = {"position": s.pos - PAD, "tile": s.tile.copy(), "next_tile": tiles_of(following)}
+        over = np.arange(s.path_cell.shape[1] - 1) >= s.path_length[:, None]
+        numbers["path"] = np.where(over[..., None], -1, tiles_of(s.path_cell[:, 1:]))
         numbers["falls"] = s.fails.copy()
         if not self.variant.endless:
             numbers["goal_tile"] = tiles_of(s.path_cell[lanes, s.path_length])

@@ -32,8 +32,8 @@ DIRECTIONS[[ROWS, -1, 1, -ROWS]] = EAST, NORTH, SOUTH, WEST
 
 
 def tiles_of(cell: np.ndarray) -> np.ndarray:
-    """(n, 2) the cells' columns and rows."""
-    return np.stack([cell // ROWS, cell % ROWS - PIT_ROWS], axis=1)
+    """(..., 2) the cells' columns and rows."""
+    return np.stack([cell // ROWS, cell % ROWS - PIT_ROWS], axis=-1)
 
 
 @dataclass

@@ -33,6 +33,9 @@ def test_mortar_mayhem(env_id):
     for envs, before, after, rewards, infos, playing, _ in told(env_id, 0.05):
         side = envs.state.size[:, None]
         np.testing.assert_allclose(infos["ground_truth"], after["target_tile"] / (side - 1))
+        count = (before["commands"] >= 0).sum(1)
+        due = before["commands"][np.arange(LANES), np.minimum(count - before["commands_left"], count - 1)]
+        assert (due == before["command"])[before["commands_left"] > 0].all()
         begins = before["length"] == 0
         started += begins.sum()
         led = (before["tile"] + MOVES[before["command"]]) % side
@@ -53,7 +56,12 @@ def test_mystery_path(env_id):
         fell += (after["falls"] - before["falls"])[playing].sum()
         for lane in np.setdiff1d(playing, ended).tolist():
             # The truth is the direction of the next tile, which stays as it was where an endless path goes left.
-            to_next = (after["next_tile"] - after["tile"])[lane]
+            to_next, path = (after["next_tile"] - after["tile"])[lane], after["path"][lane]
+            path = path[path[:, 0] >= 0]  # from the origin, tile by tile
+            assert (np.abs(np.diff(path, axis=0)).sum(1) == 1).all()
+            if envs.state.path_step[lane] > 0:
+                here = (path == after["tile"][lane]).all(1).argmax()
+                assert path[[here, here + 1][: len(path) - here]].tolist()[-1] == after["next_tile"][lane].tolist()
             if envs.state.path_step[lane] > 0 and (to_next[0] >= 0 or not envs.variant.endless):
                 on_path += 1
                 assert to_next.tolist() == headings[infos["ground_truth"][lane].argmax()].tolist()
