@@ -91,7 +91,7 @@ def check_resumes(envs, make_again, saved_after, chance=STUMBLING, steps=40):
 # ---- playing on ----
 
 
-@EACH_OBS
+@ONE_OBS
 def test_plays_on_with_the_present_options(env_id, obs_type):
     check_present_options(env_id, obs_type=obs_type)
 

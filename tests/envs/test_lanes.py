@@ -6,7 +6,7 @@
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from helpers import EACH_OBS, FAMILY, HASTY, ONE_OBS, check_same, lane_of, make, roll
+from helpers import FAMILY, HASTY, ONE_OBS, check_same, lane_of, make, roll
 
 from memory_gym_envs import MortarMayhem, MysteryPath, SearingSpotlights
 from memory_gym_envs.players import stumbling
@@ -93,7 +93,7 @@ def mixed_actions(envs, rng) -> np.ndarray:
 LEVELS = {"pixels": {}, "vector": {"num_levels": 3, "start_level": 40}}
 
 
-@EACH_OBS
+@ONE_OBS
 def test_as_gymnasiums_own(env_id, obs_type):
     """Explicit resets of every kind, and two hundred steps with automatic ones between them."""
     levels = LEVELS[obs_type]

@@ -18,7 +18,7 @@ def test_optimal_length_of_spotlight_levels():
 
 
 @pytest.mark.parametrize(
-    ("env_id", "levels", "straight"), [("MysteryPath-v0", 1000, 22), ("MysteryPath-Grid-v0", 500, 6)]
+    ("env_id", "levels", "straight"), [("MysteryPath-v0", 500, 22), ("MysteryPath-Grid-v0", 500, 6)]
 )
 def test_shortest_walk_of_path_levels(env_id, levels, straight):
     """Close to what a trained agent needs that sees the path. The shortest path leads straight ahead."""
