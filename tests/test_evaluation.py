@@ -62,14 +62,14 @@ def test_levels_that_were_trained_on(tiny):
 
 
 def test_new_levels_begin_as_none_of_the_training_s(tiny):
-    args = tiny(env_id="MysteryPath-Grid-v0", num_levels=2000, start_level=7)
-    envs = gym.make_vec(args.env_id, num_envs=2300)
+    args = tiny(env_id="MysteryPath-Grid-v0", num_levels=1500, start_level=1007)
+    envs = gym.make_vec(args.env_id, num_envs=1800)
     envs.reset(seed=args.start_level)
     s = envs.unwrapped.state
     paths = [tuple(cells[1 : 1 + length]) for cells, length in zip(s.path_cell, s.path_length, strict=True)]
-    wanted = [7 + at for at in range(2000, 2300) if paths[at] not in set(paths[:2000])]
+    wanted = [1007 + at for at in range(1500, 1800) if paths[at] not in set(paths[:1500])]
     assert 50 < len(wanted) < 250
-    assert evaluation.new_levels(args, len(wanted), 2007) == wanted
+    assert evaluation.new_levels(args, len(wanted), 2507) == wanted
     assert evaluation_levels(args, 2, 3, new=True) == [wanted[0]] * 3 + [wanted[1]] * 3
 
 

@@ -407,7 +407,20 @@ def test_what_is_wrong_in_cleanrls_transformer(empty, faults, seeded):
     report = check(CleanRLTrXLAdapter(LikeCleanRLsTransformer(empty), 8))
     assert {finding.check for finding in report.failed} == faults, str(report)
     assert "only in episodes' first steps" in str(report) or empty == "zeros"
-    assert report.dependence[4] > 0 == report.dependence[16]
+    assert min(report.dependence[1], report.dependence[4]) > 0 == report.dependence[8], "a window of 7 earlier steps"
+
+
+def test_what_cleanrls_transformer_averages_at_a_first_step(seeded):
+    """What the episode remembers later; acting, nothing."""
+    adapter, begins = CleanRLTrXLAdapter(LikeCleanRLsTransformer("all"), 8), torch.tensor([[True], [False], [False]])
+    one, other = torch.randn(2, 3, 1, 5)
+    other[0] = one[0]
+    rollouts = [adapter.rollout(obs, begins, adapter.initial(1)) for obs in (one, other)]
+    assert rollouts[0][0][0].equal(rollouts[1][0][0])
+    updates = [
+        adapter.evaluate(obs, begins, stored)[0] for obs, (*_, stored) in zip((one, other), rollouts, strict=True)
+    ]
+    assert not torch.allclose(updates[0][0], updates[1][0])
 
 
 @pytest.mark.parametrize("kind", ["LSTMModule", "GRUModule"])
