@@ -4,7 +4,6 @@ Shape letters: N environments, one for each episode.
 """
 
 import functools
-import itertools
 from typing import Any
 
 import numpy as np
@@ -64,19 +63,18 @@ def new_levels(args: RunArgs, count: int, first: int) -> list[int]:
         held = [[np.trim_zeros(part[lane] + 1, "b").tobytes() for part in told.values()] for lane in range(levels)]
         return [b"|".join(parts) for parts in held]
 
-    last, found = first_unseen(args), []
+    last = first_unseen(args)
     trained_on = {
         each for at in range(args.start_level, last, AT_ONCE) for each in beginnings(at, min(AT_ONCE, last - at))
     }
-    for at in itertools.count(first, AT_ONCE):
+    found, at = [], first
+    while len(found) < count:
         fresh = [at + lane for lane, each in enumerate(beginnings(at, AT_ONCE)) if each not in trained_on]
-        found += fresh
-        if len(found) >= count:
-            envs.close()
-            return found[:count]
         if not fresh:
             raise ValueError(f"--new-levels: levels {at} to {at + AT_ONCE - 1} all begin as some of the training do")
-    raise AssertionError
+        found, at = found + fresh, at + AT_ONCE
+    envs.close()
+    return found[:count]
 
 
 def make_agent(kind: type[nn.Module], envs: VectorEnv, infos: dict, args: RunArgs) -> nn.Module:
