@@ -44,36 +44,38 @@ def evaluation_levels(
     return [level for level in numbers for _ in range(repeats)]
 
 
-def new_levels(args: RunArgs, count: int, first: int) -> list[int]:
-    """Return the first `count` levels from `first` on that begin as none of a training's levels does.
+def beginnings(args: RunArgs, first: int, count: int) -> list[bytes]:
+    """Return what so many levels from `first` on begin with: all that `oracle()` of the Memory Gym environments tells.
 
-    By all that `oracle()` of the Memory Gym environments tells: path, commands, coins and places. Raises ValueError for
-    other environments, for a training without a limit, and where of 1,000 levels in a row none is new.
+    That is path, commands, coins and places. Raises ValueError for other environments.
     """
-    if not args.num_levels:
-        raise ValueError("--new-levels: with --num-levels 0, a training may have met any level")
     envs = envs_for(args, AT_ONCE, obs_type="vector", num_levels=0, asynchronous=False)
     if not hasattr(envs.unwrapped, "oracle"):
         raise ValueError(f"--new-levels: {args.env_id} does not tell what a level holds")
-
-    def beginnings(start: int, levels: int) -> list[bytes]:
-        envs.reset(seed=list(range(start, start + AT_ONCE)))
-        told = {name: part.reshape(AT_ONCE, -1) for name, part in envs.unwrapped.oracle().items() if name != "seed"}
+    found = []
+    while len(found) < count:
+        envs.reset(seed=[first + len(found) + lane for lane in range(AT_ONCE)])
+        told = [part.reshape(AT_ONCE, -1) for name, part in envs.unwrapped.oracle().items() if name != "seed"]
         # Paths and sequences are as long as the longest of these; -1 follows their end.
-        held = [[np.trim_zeros(part[lane] + 1, "b").tobytes() for part in told.values()] for lane in range(levels)]
-        return [b"|".join(parts) for parts in held]
+        found += [b"|".join(np.trim_zeros(part[lane] + 1, "b").tobytes() for part in told) for lane in range(AT_ONCE)]
+    envs.close()
+    return found[:count]
 
-    last = first_unseen(args)
-    trained_on = {
-        each for at in range(args.start_level, last, AT_ONCE) for each in beginnings(at, min(AT_ONCE, last - at))
-    }
+
+def new_levels(args: RunArgs, count: int, first: int) -> list[int]:
+    """Return the first `count` levels from `first` on that begin as none of a training's levels does.
+
+    Raises ValueError as `beginnings` does, for a training without a limit, and where of 1,000 levels none is new.
+    """
+    if not args.num_levels:
+        raise ValueError("--new-levels: with --num-levels 0, a training may have met any level")
+    trained_on = set(beginnings(args, args.start_level, args.num_levels))
     found, at = [], first
     while len(found) < count:
-        fresh = [at + lane for lane, each in enumerate(beginnings(at, AT_ONCE)) if each not in trained_on]
+        fresh = [at + n for n, each in enumerate(beginnings(args, at, AT_ONCE)) if each not in trained_on]
         if not fresh:
             raise ValueError(f"--new-levels: levels {at} to {at + AT_ONCE - 1} all begin as some of the training do")
         found, at = found + fresh, at + AT_ONCE
-    envs.close()
     return found[:count]
 
 

@@ -8,6 +8,7 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import tyro
@@ -17,6 +18,7 @@ import claims
 import frontier
 import learning
 import tables
+import trained_paths
 import tuning
 
 ROOT = Path(__file__).parents[1]
@@ -45,6 +47,8 @@ def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_pa
         for call in " ".join(fence.findall(section.replace("\\\n", " "))).split("python benchmarks/learning.py")[1:]:
             config = tyro.cli(learning.Config, args=shlex.split(call))
             learning.main(replace(config, report=True, out=tmp_path / "curves.png"))
+        if "python benchmarks/trained_paths.py" in section:
+            trained_paths.main(tmp_path / "paths.png")
         here = capsys.readouterr().out
         lines = [line for line in section.splitlines() if line.startswith("|")]
         assert [line for line in lines if line not in here.splitlines()] == []
@@ -56,6 +60,25 @@ def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_pa
     scores = re.findall(r"\d+\.\d+ ± \d+\.\d+", (ROOT / "README.md").read_text())
     assert len(scores) > 10
     assert [score for score in scores if score not in printed] == []
+    made, shown = (Image.open(each).size for each in (tmp_path / "paths.png", "docs/trained_paths.png"))
+    assert made == shown
+
+
+def test_how_often_a_test_level_s_path_was_trained_on(tiny):
+    """In both tasks, which have the same paths."""
+    envs = gym.make_vec("MysteryPath-Grid-v0", num_envs=1000)
+
+    def paths(first):
+        envs.reset(seed=first)
+        s = envs.unwrapped.state
+        return [tuple(cells[1 : 1 + length]) for cells, length in zip(s.path_cell, s.path_length, strict=True)]
+
+    trained_on = paths(0) + paths(1000)
+    wanted = [trained_on.count(path) for path in paths(learning.FIRST_TEST_LEVEL)]
+    assert len(set(wanted)) > 5
+    for env_id in trained_paths.RUNS:
+        times = trained_paths.times_trained_on(tiny(env_id=env_id, num_levels=2000), 1000)
+        assert times.tolist() == wanted
 
 
 def test_the_table_of_minutes_is_printed_by_its_command(capsys):

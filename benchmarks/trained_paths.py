@@ -1,0 +1,66 @@
+"""How well do agents do on test levels whose path was often, rarely or never among those they trained on?
+
+    python benchmarks/trained_paths.py
+
+The tables and the picture of docs/results.md, of the final weights in benchmarks/results. Levels with other numbers may
+have the same path. Takes 10 s. Shape letters: R seeds, M test levels, E episodes on each.
+"""
+
+import sys
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
+
+import learning
+import tables
+from ppo_utils.evaluation import beginnings
+from ppo_utils.flags import RunArgs
+
+RESULTS = Path(__file__).with_name("results")
+AGENTS = tuple(f"{name}, Muon, low rate" for name in ("no memory", "stack of 16", "GRU", "TrXL"))
+RUNS = {"MysteryPath-Grid-v0": ("laptop", 15e6), "MysteryPath-v0": ("full", 6e6)}  # suite and steps
+EDGES = (0, 1, 2, 5, 11, 31, 101, np.inf)  # a column's levels: path so often in the training, below the next
+
+
+def times_trained_on(args: RunArgs, levels: int) -> np.ndarray:
+    """Return how often each test level's path was among a training's levels, (M,)."""
+    trained_on = Counter(beginnings(args, args.start_level, args.num_levels))
+    return np.array([trained_on[each] for each in beginnings(args, learning.FIRST_TEST_LEVEL, levels)])
+
+
+def main(out: Path = Path("docs/trained_paths.png")) -> None:
+    """Print a table for each task, and draw them."""
+    figure = Figure(figsize=(9, 2.8), layout="constrained")
+    columns = ["0", "1", "2-4", "5-10", "11-30", "31-100", "more"]
+    configs = [
+        learning.Config(suite=suite, tasks=(env_id,), steps=int(steps), agents=AGENTS, results=RESULTS)
+        for env_id, (suite, steps) in RUNS.items()
+    ]
+    plans = [learning.plans_of(config) for config in configs]
+    times = times_trained_on(next(iter(plans[0].values())).args, configs[0].test_levels)  # both tasks: the same paths
+    inside = [(low <= times) & (times < high) for low, high in pairwise(EDGES)]
+    for axis, config, planned in zip(figure.subplots(1, 2, sharey=True), configs, plans, strict=True):
+        (env_id,) = config.tasks
+        print(f"| {env_id}, path trained on | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}")
+        print(f"| test levels | {' | '.join(str(each.sum()) for each in inside)} |")
+        for agent, runs in learning.results_of(config, planned)[env_id].items():
+            scores = tables.final_scores("success", runs)  # (R, M, E)
+            means = [scores[:, each].mean() for each in inside]
+            print(f"| {agent} | {' | '.join(f'{mean:.2f}' for mean in means)} |")
+            axis.plot(columns, means, marker="o", label=agent.removesuffix(", Muon, low rate"))
+        axis.set_title(env_id)
+        axis.set_xlabel("how often the level's path was trained on")
+        print()
+    axis.legend(frameon=False)
+    figure.axes[0].set_ylabel("success")
+    figure.savefig(out, dpi=120)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
