@@ -1,13 +1,16 @@
 """How well do agents do on test levels whose path was often, rarely or never among those they trained on?
 
-    python benchmarks/trained_paths.py
+    python benchmarks/trained_paths.py [--count]
 
 The tables and the picture of docs/results.md, of the final weights in benchmarks/results. Levels with other numbers may
-have the same path. Takes 10 s. Shape letters: R seeds, M test levels, E episodes on each.
+have the same path. Takes 10 s. With --count, in two minutes, the table of docs/evaluation.md: how many levels of each
+task are new. Shape letters: R seeds, M test levels, E episodes on each.
 """
 
+import json
 import sys
 from collections import Counter
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,14 +21,32 @@ from matplotlib.figure import Figure
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
 
 import learning
+import ppo_gru
 import tables
 from ppo_utils.evaluation import beginnings
 from ppo_utils.flags import RunArgs
+from suites import TASKS
 
 RESULTS = Path(__file__).with_name("results")
 AGENTS = tuple(f"{name}, Muon, low rate" for name in ("no memory", "stack of 16", "GRU", "TrXL"))
 RUNS = {"MysteryPath-Grid-v0": ("laptop", 15e6), "MysteryPath-v0": ("full", 6e6)}  # suite and steps
+LEVELS = 100_000  # that are trained on by default
+TEST_LEVELS = 1000
+COUNTED = {  # what the table calls them: id, reset options
+    **{name: (task.env_id, json.dumps(task.options)) for name, task in TASKS.items() if "ndless" not in name},
+    "quickstart": (ppo_gru.Args().env_id, ppo_gru.QUICKSTART["env_options"]),
+}
 EDGES = (0, 1, 2, 5, 11, 31, 101, np.inf)  # a column's levels: path so often in the training, below the next
+
+
+@dataclass
+class Config:
+    """What to print."""
+
+    count: bool = False
+    """how many levels of each task are new, instead of the scores"""
+    out: Path = Path("docs/trained_paths.png")
+    """where the scores are drawn"""
 
 
 def times_trained_on(args: RunArgs, levels: int) -> np.ndarray:
@@ -34,7 +55,17 @@ def times_trained_on(args: RunArgs, levels: int) -> np.ndarray:
     return np.array([trained_on[each] for each in beginnings(args, learning.FIRST_TEST_LEVEL, levels)])
 
 
-def main(out: Path = Path("docs/trained_paths.png")) -> None:
+def print_counts() -> None:
+    """Print how many of each task's training levels differ, and how many test levels begin as none of them."""
+    print("| task | different levels of the first 100,000 | new of 1,000 test levels |\n|---|---:|---:|")
+    for name, (env_id, options) in COUNTED.items():
+        args = ppo_gru.Args(env_id=env_id, env_options=options)
+        trained_on = set(beginnings(args, 0, LEVELS))
+        new = sum(each not in trained_on for each in beginnings(args, learning.FIRST_TEST_LEVEL, TEST_LEVELS))
+        print(f"| {name} | {len(trained_on):,} | {new:,} |")
+
+
+def print_scores(out: Path) -> None:
     """Print a table for each task, and draw them."""
     figure = Figure(figsize=(9, 2.8), layout="constrained")
     columns = ["0", "1", "2-4", "5-10", "11-30", "31-100", "more"]
@@ -62,5 +93,13 @@ def main(out: Path = Path("docs/trained_paths.png")) -> None:
     figure.savefig(out, dpi=120)
 
 
+def main(config: Config) -> None:
+    """Count levels, or print scores and draw them."""
+    if config.count:
+        print_counts()
+    else:
+        print_scores(config.out)
+
+
 if __name__ == "__main__":
-    tyro.cli(main)
+    main(tyro.cli(Config))

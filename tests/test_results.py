@@ -17,9 +17,11 @@ from PIL import Image
 import claims
 import frontier
 import learning
+import ppo_gru
 import tables
 import trained_paths
 import tuning
+from ppo_utils import evaluation
 
 ROOT = Path(__file__).parents[1]
 
@@ -48,7 +50,7 @@ def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_pa
             config = tyro.cli(learning.Config, args=shlex.split(call))
             learning.main(replace(config, report=True, out=tmp_path / "curves.png"))
         if "python benchmarks/trained_paths.py" in section:
-            trained_paths.main(tmp_path / "paths.png")
+            trained_paths.main(trained_paths.Config(out=tmp_path / "paths.png"))
         here = capsys.readouterr().out
         lines = [line for line in section.splitlines() if line.startswith("|")]
         assert [line for line in lines if line not in here.splitlines()] == []
@@ -105,3 +107,16 @@ def test_the_page_ends_with_the_tables_of_the_results_that_are_there(capsys):
     for claim in claims.CLAIMS.values():  # whose command lines have been parsed by now
         plans = [plan for agent in claim.agents for plan in claim.plans(claims.Config(seeds=(1,)), agent)]
         assert len({tuple(plan.logged_args().items()) for plan in plans}) == len(plans), "no two are the same"
+
+
+def test_counts_of_levels(monkeypatch, capsys):
+    """Of the first hundred: two commands on the grid have few different beginnings."""
+    for name, value in {"LEVELS": 100, "TEST_LEVELS": 50}.items():
+        monkeypatch.setattr(trained_paths, name, value)
+    monkeypatch.setattr(trained_paths, "COUNTED", {name: trained_paths.COUNTED[name] for name in ("quickstart",)})
+    trained_paths.main(trained_paths.Config(count=True))
+    args = ppo_gru.Args(env_options=ppo_gru.QUICKSTART["env_options"])
+    seen = set(evaluation.beginnings(args, 0, 100))
+    new = [each for each in evaluation.beginnings(args, learning.FIRST_TEST_LEVEL, 50) if each not in seen]
+    assert 0 < len(new) < 50
+    assert f"| quickstart | {len(seen)} | {len(new)} |" in capsys.readouterr().out
