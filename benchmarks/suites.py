@@ -29,6 +29,7 @@ MUON = {  # --preset laptop, with what all agents have (learning.COMMON)
 # Muon with what the thesis has: smaller steps, a longer horizon, rewards as they are.
 LOW_RATE = "--init-lr 3e-4 --gamma 0.995 --clip-coef 0.1 --no-norm-reward"
 LOW_RATE += " --exploration-bonus entropy --init-ent-coef 1e-4 --final-ent-coef 1e-5"
+ONE_PRESET = "--init-lr 3e-4 --gamma 0.995 --vf-coef 0.05"
 AGENTS = {
     "no memory": f"{GRU} --memory none",
     "stack of 4": f"{GRU} --memory none --frame-stack 4",
@@ -37,6 +38,8 @@ AGENTS = {
     **MEMORIES,
     "TrXL, preset": ADAMW_TRXL,
     **MUON,
+    # One preset for all tasks: small steps, a long horizon, and a value that does not outweigh the policy.
+    "TrXL, one preset": f"ppo_trxl.py --attend-commands --value-init-gain 0.01 {ONE_PRESET}",
     # --preset laptop as it is.
     "GRU, laptop": "ppo_gru.py --attend-commands",
     "TrXL, laptop": "ppo_trxl.py --attend-commands --value-init-gain 0.01",
