@@ -150,16 +150,17 @@ LAPTOP = {
     "preset": "laptop", "obs_type": "vector", "attend_commands": True, "trunk_size": 128,
     "trxl_num_layers": 1, "trxl_dim": 96, "trxl_query_position": True, "trxl_memory_gradient": True,
     "num_envs": 128, "num_steps": 128, "num_minibatches": 16, "update_epochs": 2,
-    "norm_reward": True, "gamma": 0.99, "clip_coef": 0.2, "target_kl": 0.05, "max_grad_norm": 0.5,
+    "norm_reward": True, "gamma": 0.995, "clip_coef": 0.2, "vf_coef": 0.05, "target_kl": 0.05, "max_grad_norm": 0.5,
     "exploration_bonus": "log-barrier", "init_ent_coef": 2e-3, "final_ent_coef": 2e-4,
-    "optimizer": "muon", "init_lr": 1e-3, "final_lr": 1e-4, "total_timesteps": 6_000_000, "anneal_steps": None,
+    "optimizer": "muon", "init_lr": 3e-4, "final_lr": 1e-4, "total_timesteps": 6_000_000, "anneal_steps": None,
 }  # fmt: skip
 QUICKSTART = {
     **LAPTOP, "preset": "quickstart",
     # Two commands, each shown for one step, and six steps to carry one out.
     "env_options": '{"command_count": [2], "command_show_duration": [1], "command_show_delay": [0], '
     '"explosion_delay": [4], "explosion_duration": [2]}',
-    "trunk_size": 64, "num_steps": 32, "num_minibatches": 8, "init_lr": 4e-3, "total_timesteps": 400_000,
+    "trunk_size": 64, "num_steps": 32, "num_minibatches": 8, "gamma": 0.99, "vf_coef": 0.5, "init_lr": 4e-3,
+    "total_timesteps": 400_000,
 }  # fmt: skip
 PRESETS = {"thesis": {}, "laptop": LAPTOP, "quickstart": QUICKSTART}  # thesis: the defaults above
 

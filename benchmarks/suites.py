@@ -10,7 +10,8 @@ from ppo_utils.scores import own_metric
 ADAMW = "--optimizer adamw --no-norm-reward --num-envs 32 --update-epochs 4 --num-minibatches 8"
 ADAMW += " --init-lr 1e-3 --final-lr 1e-4 --init-ent-coef 5e-4 --final-ent-coef 5e-5"
 GRU = f"ppo_gru.py {ADAMW}"
-ADAMW_TRXL = f"ppo_trxl.py {ADAMW} --trxl-num-layers 2 --trxl-dim 64 --trxl-memory-length 128"
+BEFORE = "ppo_trxl.py --init-lr 1e-3 --gamma 0.99 --vf-coef 0.5"  # what --preset laptop had for the transformer
+ADAMW_TRXL = f"{BEFORE} {ADAMW} --trxl-num-layers 2 --trxl-dim 64 --trxl-memory-length 128"
 TRXL = f"{ADAMW_TRXL} --no-trxl-query-position --no-trxl-memory-gradient"  # the thesis', where the preset differs
 MEMORIES = {
     "GRU": f"{GRU} --memory gru",
@@ -24,12 +25,11 @@ MUON = {  # --preset laptop, with what all agents have (learning.COMMON)
     "no memory, Muon": "ppo_gru.py --memory none",
     "stack of 16, Muon": "ppo_gru.py --memory none --frame-stack 16",
     "GRU, Muon": "ppo_gru.py",
-    "TrXL, Muon": "ppo_trxl.py",
+    "TrXL, Muon": BEFORE,
 }
 # Muon with what the thesis has: smaller steps, a longer horizon, rewards as they are.
 LOW_RATE = "--init-lr 3e-4 --gamma 0.995 --clip-coef 0.1 --no-norm-reward"
 LOW_RATE += " --exploration-bonus entropy --init-ent-coef 1e-4 --final-ent-coef 1e-5"
-ONE_PRESET = "--init-lr 3e-4 --gamma 0.995 --vf-coef 0.05"
 AGENTS = {
     "no memory": f"{GRU} --memory none",
     "stack of 4": f"{GRU} --memory none --frame-stack 4",
@@ -38,11 +38,11 @@ AGENTS = {
     **MEMORIES,
     "TrXL, preset": ADAMW_TRXL,
     **MUON,
-    # One preset for all tasks: small steps, a long horizon, and a value that does not outweigh the policy.
-    "TrXL, one preset": f"ppo_trxl.py --attend-commands --value-init-gain 0.01 {ONE_PRESET}",
     # --preset laptop as it is.
+    "TrXL, one preset": "ppo_trxl.py --attend-commands --value-init-gain 0.01",
+    # What --preset laptop was when it came to read lists by attention.
     "GRU, laptop": "ppo_gru.py --attend-commands",
-    "TrXL, laptop": "ppo_trxl.py --attend-commands --value-init-gain 0.01",
+    "TrXL, laptop": f"{BEFORE} --attend-commands --value-init-gain 0.01",
     **{f"{name}, low rate": f"{flags} {LOW_RATE}" for name, flags in MUON.items()},
     **{f"{name}, entropy": f"{flags} {ENTROPY}" for name, flags in MEMORIES.items()},
     **{f"{name}, refreshed": f"{flags} --refresh-memory" for name, flags in MEMORIES.items()},

@@ -45,11 +45,12 @@ def test_every_agent_s_command_can_be_parsed(task, agent):
     assert args.total_timesteps == args.anneal_steps == 6_000_000
     assert args.refresh_memory == ("refreshed" in agent)
     # The thesis' queries do not know their step.
-    of_a_preset = agent.startswith(("TrXL, preset", "TrXL, Muon", "TrXL, laptop"))
+    of_a_preset = agent.startswith(("TrXL, preset", "TrXL, Muon", "TrXL, laptop", "TrXL, one preset"))
     assert getattr(args, "trxl_query_position", False) == of_a_preset
     assert getattr(args, "trxl_memory_gradient", False) == ("gradient" in agent or of_a_preset)
     assert getattr(args, "trxl_gate", None) == {"TrXL": "none", "GTrXL": "gru"}.get(agent.split(",")[0])
-    assert (args.init_lr == 3e-4) == (args.gamma == 0.995) == (args.clip_coef == 0.1) == ("low rate" in agent)
+    assert (args.init_lr == 3e-4) == (args.gamma == 0.995) == ("low rate" in agent or "one preset" in agent)
+    assert (args.clip_coef == 0.1) == ("low rate" in agent)
 
 
 def test_an_agent_may_have_further_flags(tmp_path):
