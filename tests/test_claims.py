@@ -108,6 +108,26 @@ def test_where_nobody_is_above_an_agent_without_memory_nothing_was_learned():
     assert claims.is_learned(claim, {"GRU": low[:1], "TrXL": low[:1]}, low[:1]), "nor with one seed"
 
 
+@pytest.mark.parametrize(
+    ("name", "least"),
+    [
+        ("samples-MortarMayhem-Grid-v0", 0.25),
+        ("falls-mystery-path", 0.9),
+        ("score-Endless-MortarMayhem-v0", 4.5),  # of 18
+        ("score-Endless-MysteryPath-v0", 0.505),  # of 2.02
+    ],
+)
+def test_a_task_of_which_little_was_learned(name, least):
+    claim = claims.CLAIMS[name]
+
+    def runs(mean):
+        curve = np.array([100]), np.full((1, 4, 1), mean)
+        return [RunLog("", {}, {f"eval/{claims.TASKS[claim.task].score}": curve})] * 2
+
+    assert claims.is_learned(claim, {"GRU": runs(least + 0.01), "TrXL": runs(0.1)}, [])
+    assert not claims.is_learned(claim, {"GRU": runs(least - 0.01), "TrXL": runs(0.1)}, [])
+
+
 def test_runs_with_test_levels_are_compared_with_runs_without():
     """On the development levels, which all have."""
     steps = np.array([100])
