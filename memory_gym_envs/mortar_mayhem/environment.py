@@ -58,22 +58,11 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     ## Action Space
 
-    `MultiDiscrete([3, 3])`:
-
-    | value | horizontal | vertical |
-    |---|---|---|
-    | 0 | none | none |
-    | 1 | left | up |
-    | 2 | right | down |
-
-    `Discrete(4)`, Grid ids:
-
-    | value | action |
-    |---|---|
-    | 0 | nothing |
-    | 1 | turn left |
-    | 2 | turn right |
-    | 3 | one tile forward |
+    | space | 0 | 1 | 2 | 3 |
+    |---|---|---|---|---|
+    | `MultiDiscrete([3, 3])`, horizontal | none | left | right | |
+    | and vertical | none | up | down | |
+    | `Discrete(4)`, Grid ids | nothing | turn left | turn right | one tile forward |
 
     Actions are ignored while a clue is shown.
 

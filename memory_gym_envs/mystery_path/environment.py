@@ -63,31 +63,12 @@ class MysteryPath(MemoryGymVectorEnv):
 
     ## Action Space
 
-    `MultiDiscrete([3, 3])`:
-
-    | value | horizontal | vertical |
-    |---|---|---|
-    | 0 | none | none |
-    | 1 | left | up |
-    | 2 | right | down |
-
-    `Discrete(4)`, Grid id:
-
-    | value | action |
-    |---|---|
-    | 0 | nothing |
-    | 1 | turn left |
-    | 2 | turn right |
-    | 3 | one tile forward |
-
-    `Discrete(4)`, endless id:
-
-    | value | action |
-    |---|---|
-    | 0 | nothing |
-    | 1 | right |
-    | 2 | up |
-    | 3 | down |
+    | space | 0 | 1 | 2 | 3 |
+    |---|---|---|---|---|
+    | `MultiDiscrete([3, 3])`, horizontal | none | left | right | |
+    | and vertical | none | up | down | |
+    | `Discrete(4)`, Grid id | nothing | turn left | turn right | one tile forward |
+    | `Discrete(4)`, endless id | nothing | right | up | down |
 
     ## Observation Space
 

@@ -56,13 +56,10 @@ class SearingSpotlights(MemoryGymVectorEnv):
 
     ## Action Space
 
-    `MultiDiscrete([3, 3])`:
-
-    | value | horizontal | vertical |
-    |---|---|---|
-    | 0 | none | none |
-    | 1 | left | up |
-    | 2 | right | down |
+    | space | 0 | 1 | 2 |
+    |---|---|---|---|
+    | `MultiDiscrete([3, 3])`, horizontal | none | left | right |
+    | and vertical | none | up | down |
 
     ## Observation Space
 
