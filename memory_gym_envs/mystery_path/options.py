@@ -14,14 +14,6 @@ SEGMENT = SIDE + 1  # columns of a segment and the transition tile behind it
 # Of the finite ids: what AGaLiTe (Pramanik et al., 2023) calls easy.
 EASY = {"show_origin": True, "show_goal": True, "reward_path_progress": 0.1}
 
-SHOWN = {  # by the options that show something: the state has a field show_... for each
-    "origin": "show_origin",
-    "goal": "show_goal",
-    "past": "show_past_path",
-    "ground": "show_background",
-    "stamina": "show_stamina",
-}
-
 
 def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
     """The reset options of an id, in the original's order."""

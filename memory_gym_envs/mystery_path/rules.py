@@ -9,7 +9,6 @@ from memory_gym_envs.character import FACINGS, PAD, SPAN
 from memory_gym_envs.mystery_path.options import SIDE, TILE
 from memory_gym_envs.mystery_path.state import NO_STEP, ORIGIN, PIT_ROWS, ROWS, WEST, State
 
-BRANCHES = np.array([3, 1])  # numbers the actions of two branches from 0 to 8
 TILE_AT = (np.arange(SPAN) - PAD) // TILE  # of stored positions on the screen
 # The endless id's actions: 0 nothing, 1 right, 2 up, 3 down.
 ENDLESS_MOVES = np.array([(0, 0), (1, 0), (0, -1), (0, 1)])  # (4, 2)

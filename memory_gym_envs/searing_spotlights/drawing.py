@@ -171,7 +171,6 @@ def set_pictures(s: State, lanes: np.ndarray, values: dict[str, Any]) -> None:
     coins, exit_, agent = values["coins_visible"], values.get("exit_visible", False), values["agent_visible"]
     plain = WHITE_FLOOR if values["hide_chessboard"] else BLUE_FLOOR
     alarm = RED_FLOOR if plain == BLUE_FLOOR and values["visual_feedback"] else plain
-    s.rim[lanes] = values["black_background"]
     s.floors[lanes] = BLACK_FLOOR if values["black_background"] else (plain, alarm)
     s.darkness[lanes] = opacity = fading(values["light_dim_off_duration"], values["light_threshold"])
     # Rims are blended like dimmed pixels, so with rims the darkness is never just black.

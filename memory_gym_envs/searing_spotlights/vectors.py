@@ -91,7 +91,7 @@ class VectorTables(NamedTuple):
     has_hands: np.ndarray  # (N,) bool: the agent has hands, which show its facing
 
 
-def vector_tables(
+def make_vector_tables(
     s: State,
     variant: Variant,
     radii: tuple[int, int],
