@@ -9,20 +9,11 @@ import gymnasium as gym
 import numpy as np
 
 from memory_gym_envs.character import Figure
+from memory_gym_envs.mortar_mayhem import drawing, levels, rules, vectors
 from memory_gym_envs.mortar_mayhem.arena import COMMANDS, FLOORS, TILE, TORUS_SIZE, first_pixel
-from memory_gym_envs.mortar_mayhem.drawing import circle_target, draw
-from memory_gym_envs.mortar_mayhem.levels import sample_level, write_level
 from memory_gym_envs.mortar_mayhem.options import VARIANTS, VECTOR_COMMANDS, MortarVariant
-from memory_gym_envs.mortar_mayhem.rules import (
-    burn_agents,
-    extend_sequence,
-    extinguish_tiles,
-    ignite_tiles,
-    on_target,
-    show_clue,
-)
 from memory_gym_envs.mortar_mayhem.state import State
-from memory_gym_envs.mortar_mayhem.vectors import VectorTables, make_vector_tables, make_vectors
+from memory_gym_envs.mortar_mayhem.vectors import VectorTables
 from memory_gym_envs.state import Lanes, empty, make_room
 from memory_gym_envs.walking import WalkingVectorEnv
 from memory_gym_envs.words import below, words
@@ -148,13 +139,13 @@ class MortarMayhem(WalkingVectorEnv):
 
     def vector_tables(self) -> VectorTables:
         """The tables of vector observations."""
-        return make_vector_tables(self.variant, self.figures, self.state.figure)
+        return vectors.make_vector_tables(self.variant, self.figures, self.state.figure)
 
     def begin(self, lanes: np.ndarray) -> None:
         """Samples the lanes' next levels and starts their episodes."""
         for lane in lanes.tolist():
-            level = sample_level(self._rngs[lane], self.settings[lane], self.variant)
-            write_level(self.state, lane, level, self.variant)
+            level = levels.sample_level(self._rngs[lane], self.settings[lane], self.variant)
+            levels.write_level(self.state, lane, level, self.variant)
         self._clues_open = self.variant.clue
 
     def apply_rules(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -170,14 +161,14 @@ class MortarMayhem(WalkingVectorEnv):
             due = s.timer == 0  # only a lane that acts gets there
             if np.count_nonzero(due):
                 self._change_tiles(due.nonzero()[0], rewards, terminated)
-            burn_agents(s, acting, rewards, terminated)
+            rules.burn_agents(s, acting, rewards, terminated)
         return rewards, terminated
 
     def _acting_lanes(self) -> np.ndarray:
         """Shows the clues' next step. Which lanes may act: (N,) bool, or EVERY_LANE while no clue is shown."""
         if not self._clues_open:
             return EVERY_LANE
-        acting = show_clue(self.state, self._lane_clue)
+        acting = rules.show_clue(self.state, self._lane_clue)
         self._clues_open = bool(np.count_nonzero(acting) < self.num_envs)
         return acting
 
@@ -186,10 +177,10 @@ class MortarMayhem(WalkingVectorEnv):
         s = self.state
         burning = s.burning[lanes]
         if np.count_nonzero(burning):
-            extinguish_tiles(s, lanes[burning])
+            rules.extinguish_tiles(s, lanes[burning])
             lanes = lanes[~burning]
         if lanes.size:
-            rewards[lanes], sequence_over = ignite_tiles(s, lanes)
+            rewards[lanes], sequence_over = rules.ignite_tiles(s, lanes)
             if self.variant.endless:
                 for lane in lanes[sequence_over].tolist():
                     self._extend_sequence(lane)
@@ -200,7 +191,7 @@ class MortarMayhem(WalkingVectorEnv):
 
     def _extend_sequence(self, lane: int) -> None:
         """Appends a random command to the lane's sequence."""
-        extend_sequence(self.state, lane, below(words(self._rngs[lane]), self.settings[lane]["allowed_commands"]))
+        rules.extend_sequence(self.state, lane, below(words(self._rngs[lane]), self.settings[lane]["allowed_commands"]))
         self._clues_open = True
 
     def pixels(self, lanes: Lanes) -> Any:
@@ -212,11 +203,11 @@ class MortarMayhem(WalkingVectorEnv):
 
     def vectors(self, lanes: Lanes) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32."""
-        return make_vectors(self.state, self._vector_tables, lanes)
+        return vectors.make_vectors(self.state, self._vector_tables, lanes)
 
     def frames(self, lanes: Lanes) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3) uint8."""
-        return draw(self.state, self._agent_tables.sheet, lanes)
+        return drawing.draw(self.state, self._agent_tables.sheet, lanes)
 
     def ground_truth(self) -> np.ndarray:
         """A fresh (N, 2): the target's column and row, divided by arena size - 1."""
@@ -228,7 +219,7 @@ class MortarMayhem(WalkingVectorEnv):
         if self.variant.endless:
             return numbers | {"commands_completed": s.completed[lanes], "max_command_sequence": s.count[lanes] - 1}
         success = s.current[lanes] >= s.count[lanes]
-        failed = s.burning[lanes] & ~on_target(s, lanes) & ~success
+        failed = s.burning[lanes] & ~rules.on_target(s, lanes) & ~success
         share = (s.current[lanes] - failed) / s.count[lanes]
         numbers |= {"success": success.astype(np.int64), "commands_completed": share}
         carried_out = s.completed[lanes] / s.count[lanes]
@@ -259,4 +250,4 @@ class MortarMayhem(WalkingVectorEnv):
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Circles the lane's target tile in its magnified frame, in place."""
-        circle_target(frame, self.state, lane)
+        drawing.circle_target(frame, self.state, lane)

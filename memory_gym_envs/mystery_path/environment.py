@@ -1,27 +1,17 @@
 """The Mystery Path environments."""
 
-import math
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from memory_gym_envs.appearance import VectorTables
 from memory_gym_envs.base import DEBUG_ZOOM
 from memory_gym_envs.character import PAD, Figure, radius_of
 from memory_gym_envs.drawing import SCREEN, magnify
-from memory_gym_envs.mystery_path.drawing import CROSS, STAMINA_BAR, camera_columns, draw, draw_truth
-from memory_gym_envs.mystery_path.levels import FIRST_SEGMENTS, append_segment, sample_level, write_level
+from memory_gym_envs.mystery_path import drawing, levels, rules, vectors
 from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE, VARIANTS
-from memory_gym_envs.mystery_path.rules import (
-    TILE_AT,
-    enter_tiles,
-    forget_trails,
-    put_back,
-    spend_stamina,
-    walk_endless,
-)
 from memory_gym_envs.mystery_path.state import (
-    FAST,
     MAP_STRIDES,
     NO_CELL,
     PIT,
@@ -31,7 +21,6 @@ from memory_gym_envs.mystery_path.state import (
     make_path_room,
     tiles_of,
 )
-from memory_gym_envs.mystery_path.vectors import VectorTables, ViewOptions, make_vector_tables, make_vectors
 from memory_gym_envs.state import Lanes, empty
 from memory_gym_envs.walking import WalkingVectorEnv, numbered
 
@@ -114,7 +103,7 @@ class MysteryPath(WalkingVectorEnv):
 
     def allocate(self) -> None:
         """Makes the state of N lanes."""
-        segments = FIRST_SEGMENTS + 1 if self.variant.endless else 1
+        segments = levels.FIRST_SEGMENTS + 1 if self.variant.endless else 1
         self.state = empty(State, N=self.num_envs, P=SIDE * SIDE + 1, M=segments * SEGMENT * ROWS, T=0)
         self.state.path_cell[:, PIT] = NO_CELL
 
@@ -123,17 +112,8 @@ class MysteryPath(WalkingVectorEnv):
         s, values = self.state, self.settings[int(lanes[0])]
         s.radius[lanes] = radius_of(self.scale_of(values))
         s.extras[lanes] = (s.show_origin | s.show_goal | s.show_ground | s.show_stamina)[lanes]
-        if not self.variant.endless:
-            return
-        speed = int(values["agent_speed"])
-        s.extras[lanes] |= values["agent_speed"] > FAST
-        s.speed[lanes] = speed
-        s.camera[lanes] = TILE * values["camera_offset_scale"]
-        s.trail_columns[lanes] = int(values["camera_offset_scale"])
-        s.ground_period[lanes] = speed * math.ceil(TILE / speed) if speed else 1
-        figure_x, cross_x = camera_columns(values)
-        s.figure_x[lanes], s.cross_x[lanes] = figure_x, cross_x
-        s.cross_fits[lanes] = cross_x < PAD + SCREEN - STAMINA_BAR * values["show_stamina"] + CROSS // 2
+        if self.variant.endless:
+            drawing.place_camera(s, lanes, values)
 
     def figures_of(self, values: dict[str, Any]) -> tuple[Figure, ...]:
         """The agent's figure under these options."""
@@ -141,7 +121,9 @@ class MysteryPath(WalkingVectorEnv):
 
     def place_tables(self) -> None:
         """Looks up the tables that follow from the options, and where each lane's rows start in them."""
-        self.view_options, self.state.view[:] = numbered([self._view_options(values) for values in self.settings])
+        endless = self.variant.endless
+        every = [vectors.view_options_of(values, self.scale_of(values), endless) for values in self.settings]
+        self.view_options, self.state.view[:] = numbered(every)
         super().place_tables()
         self._place_lanes()
 
@@ -150,46 +132,39 @@ class MysteryPath(WalkingVectorEnv):
         self._lane_map = np.arange(self.num_envs) * self.state.step_at.shape[1] + PIT_ROWS  # (N,)
         self._lane_path = np.arange(self.num_envs) * self.state.path_cell.shape[1]  # (N,)
 
-    def _view_options(self, values: dict[str, Any]) -> ViewOptions:
-        scale = self.scale_of(values)
-        if not self.variant.endless:
-            return ViewOptions(scale, None, 0, SCREEN)
-        figure_x, cross_x = camera_columns(values)
-        return ViewOptions(scale, figure_x, cross_x - figure_x, SCREEN - STAMINA_BAR * values["show_stamina"])
-
     def vector_tables(self) -> VectorTables:
         """The tables of vector observations."""
-        return make_vector_tables(self.variant.entries, self.view_options)
+        return vectors.make_vector_tables(self.variant, self.view_options, self.state.view)
 
     def begin(self, lanes: np.ndarray) -> None:
         """Samples the lanes' next levels and starts their episodes."""
-        forget_trails(self.state, lanes)
+        rules.forget_trails(self.state, lanes)
         for lane in lanes.tolist():
-            level = sample_level(self._rngs[lane], self.settings[lane], self.variant)
+            level = levels.sample_level(self._rngs[lane], self.settings[lane], self.variant)
             if make_path_room(self.state, len(level.path), len(level.walls)):
                 self._place_lanes()
-            write_level(self.state, lane, level, self.variant.endless)
+            levels.write_level(self.state, lane, level, self.variant.endless)
 
     def apply_rules(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Walks, and enters a tile or falls off: rewards and terminations, (N,) each."""
         s, endless = self.state, self.variant.endless
         if np.count_nonzero(s.fallen):
-            action = put_back(s, action)
+            action = rules.put_back(s, action)
         if endless:
-            walk_endless(s, action)
+            rules.walk_endless(s, action)
             s.tile = (s.pos - PAD) // TILE  # (N, 2)
             self._extend_paths()
         else:
             self.move_agents(action)
-            s.tile = TILE_AT.take(s.pos)  # (N, 2)
+            s.tile = rules.TILE_AT.take(s.pos)  # (N, 2)
         cell = s.tile.dot(MAP_STRIDES) + self._lane_map  # (N,)
         before, s.path_step = s.path_step, s.step_at.take(cell)
         s.fallen = s.path_step == PIT
         rewards = s.reward_step.copy()
         landed = int(np.count_nonzero(s.path_step != before))
         if landed:
-            enter_tiles(s, self._lane_path, rewards, endless)
-        terminated = spend_stamina(s, cell, landed) if endless else s.path_step == s.path_length
+            rules.enter_tiles(s, self._lane_path, rewards, endless)
+        terminated = rules.spend_stamina(s, cell, landed) if endless else s.path_step == s.path_length
         if not endless and np.count_nonzero(terminated):
             rewards += terminated * s.reward_goal
         return rewards, terminated
@@ -201,16 +176,16 @@ class MysteryPath(WalkingVectorEnv):
         if not np.count_nonzero(entered):
             return
         for lane in np.flatnonzero(entered).tolist():
-            if append_segment(s, lane, self._rngs[lane]):
+            if levels.append_segment(s, lane, self._rngs[lane]):
                 self._place_lanes()
 
     def vectors(self, lanes: Lanes) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32."""
-        return make_vectors(self.state, self._vector_tables, lanes, self.variant.endless)
+        return vectors.make_vectors(self.state, self._vector_tables, lanes, self.variant.endless)
 
     def frames(self, lanes: Lanes) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3) uint8."""
-        return draw(self.state, self._agent_tables.sheet, lanes, self.variant.endless)
+        return drawing.draw(self.state, self._agent_tables.sheet, lanes, self.variant.endless)
 
     def ground_truth(self) -> np.ndarray:
         """The direction of the path's next tile: a fresh one-hot (N, 4), endless (N, 3)."""
@@ -246,4 +221,5 @@ class MysteryPath(WalkingVectorEnv):
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Draws the path in white, its origin and transition tiles blue, its goal green, walls red, then the agent."""
-        frame[:] = magnify(draw_truth(self.state, self._agent_tables.sheet, lane, self.variant.endless), DEBUG_ZOOM)
+        truth = drawing.draw_truth(self.state, self._agent_tables.sheet, lane, self.variant.endless)
+        frame[:] = magnify(truth, DEBUG_ZOOM)

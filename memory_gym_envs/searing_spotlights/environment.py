@@ -8,33 +8,10 @@ from memory_gym_envs.base import DEBUG_ZOOM, NO_LIMIT
 from memory_gym_envs.bits import PLACE_0, PLACES, pixel_scratch
 from memory_gym_envs.character import PAD, Figure
 from memory_gym_envs.drawing import GREEN, SCREEN, magnify, ring
-from memory_gym_envs.searing_spotlights.drawing import (
-    TOP_BAR,
-    DrawingTables,
-    bars,
-    coin_and_exit_sheet,
-    draw,
-    draw_in_full_light,
-    draw_scenery,
-    set_pictures,
-    spot_stencils,
-)
-from memory_gym_envs.searing_spotlights.levels import sample_coin, sample_delay, sample_level, sample_spot, write_level
+from memory_gym_envs.searing_spotlights import drawing, levels, rules, vectors
+from memory_gym_envs.searing_spotlights.drawing import TOP_BAR
 from memory_gym_envs.searing_spotlights.options import VARIANTS
-from memory_gym_envs.searing_spotlights.rules import (
-    add_spot,
-    burn,
-    coin_show_limit,
-    count_step,
-    leave,
-    move_spots,
-    place_coin,
-    set_rules,
-    take_coins,
-    touched_bodies,
-)
 from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, RADIUS, State
-from memory_gym_envs.searing_spotlights.vectors import VectorTables, make_vector_tables, make_vectors
 from memory_gym_envs.state import Lanes, empty, make_room
 from memory_gym_envs.walking import WalkingVectorEnv, numbered
 from memory_gym_envs.words import words
@@ -134,8 +111,8 @@ class SearingSpotlights(WalkingVectorEnv):
         """Takes over the options of the lanes that mean more than a number, and makes room for the coins."""
         values, endless = self.settings[int(lanes[0])], self.variant.endless
         make_room(self.state, "B", COIN + (1 if endless else max((1, *values["num_coins"]))))
-        set_rules(self.state, lanes, values, endless)
-        set_pictures(self.state, lanes, values)
+        rules.set_rules(self.state, lanes, values, endless)
+        drawing.set_pictures(self.state, lanes, values)
 
     def figures_of(self, values: dict[str, Any]) -> tuple[Figure, ...]:
         """The agent's figure as it walks across and as it walks down, where the bar is in its way."""
@@ -148,28 +125,28 @@ class SearingSpotlights(WalkingVectorEnv):
         every = [values[name] for values in self.settings for name in ("spot_min_radius", "spot_max_radius")]
         self._radii = int(min(every)), int(max(every))  # the smallest and the largest
         super().place_tables()
-        self._drawing = DrawingTables(
-            spots=spot_stencils(*self._radii),
+        self._drawing = drawing.DrawingTables(
+            spots=drawing.spot_stencils(*self._radii),
             figures=self._agent_tables.sheet,
-            coins_and_exits=coin_and_exit_sheet(self.scales),
-            bars=bars(self.variant.endless),
+            coins_and_exits=drawing.coin_and_exit_sheet(self.scales),
+            bars=drawing.bars(self.variant.endless),
             scratch=pixel_scratch(self.num_envs),
         )
         self._calm = np.arange(0, 2 * self.num_envs, 2)  # (N,) the scenery's calm rows
 
-    def vector_tables(self) -> VectorTables:
+    def vector_tables(self) -> vectors.VectorTables:
         """The tables of vector observations."""
         figure_scales = tuple(across.scale for across in self.figures[::2])
         has_hands = [int(10 * values["agent_scale"]) > 0 for values in self.settings]
-        return make_vector_tables(self.state, self.variant, self._radii, figure_scales, self.scales, has_hands)
+        return vectors.make_vector_tables(self.state, self.variant, self._radii, figure_scales, self.scales, has_hands)
 
     def begin(self, lanes: np.ndarray) -> None:
         """Samples the lanes' next levels and starts their episodes."""
         for lane in lanes.tolist():
             values = self.settings[lane]
             spawns = NO_LIMIT if self.variant.endless else values["num_spawns"]
-            level = sample_level(self._rngs[lane], values, self.variant)
-            write_level(self.state, lane, level, spawns, coin_show_limit(values, first=True))
+            level = levels.sample_level(self._rngs[lane], values, self.variant)
+            levels.write_level(self.state, lane, level, spawns, rules.coin_show_limit(values, first=True))
             self._draw_scenery(lane)
             if not level.coins:
                 self._unlocked.append(lane)
@@ -180,16 +157,16 @@ class SearingSpotlights(WalkingVectorEnv):
         self._move(action)
         self._unlock()
         self._spawn()
-        hit = move_spots(s)
+        hit = rules.move_spots(s)
         rewards, terminated, s.floor = s.reward_outside.copy(), np.zeros(self.num_envs, bool), self._calm.copy()
         if np.count_nonzero(hit):
-            burn(s, np.flatnonzero(hit), rewards, terminated)
-        touched, shown = touched_bodies(s), {}
+            rules.burn(s, np.flatnonzero(hit), rewards, terminated)
+        touched, shown = rules.touched_bodies(s), {}
         if np.count_nonzero(touched):
             shown = self._collect(touched, rewards)
             if not endless:
-                leave(s, touched, rewards, terminated)
-        count_step(s, rewards, terminated, shown, endless)
+                rules.leave(s, touched, rewards, terminated)
+        rules.count_step(s, rewards, terminated, shown, endless)
         return rewards, terminated
 
     def _move(self, action: np.ndarray) -> None:
@@ -214,7 +191,7 @@ class SearingSpotlights(WalkingVectorEnv):
         if np.count_nonzero(due):
             for lane in np.flatnonzero(due).tolist():
                 rng, values = self._rngs[lane], self.settings[lane]
-                add_spot(s, lane, sample_spot(rng, values), sample_delay(rng, values))
+                rules.add_spot(s, lane, levels.sample_spot(rng, values), levels.sample_delay(rng, values))
 
     def _collect(self, touched: np.ndarray, rewards: np.ndarray) -> dict[int, float]:
         """Takes the coins that are touched, (N, B) bool; the endless id then has a new one.
@@ -226,28 +203,28 @@ class SearingSpotlights(WalkingVectorEnv):
             last, values = tuple(s.bodies[:, lane, COIN].tolist()), self.settings[lane]
             if self.variant.endless and not values["coin_feedback"]:
                 shown[lane] = float(rewards[lane])
-            rewards[lane] += s.reward_coin[lane] * take_coins(s, lane, touched[lane])
+            rewards[lane] += s.reward_coin[lane] * rules.take_coins(s, lane, touched[lane])
             if self.variant.endless:
-                place = sample_coin(words(self._rngs[lane]), last)
-                place_coin(s, lane, place, coin_show_limit(values, first=False))
+                place = levels.sample_coin(words(self._rngs[lane]), last)
+                rules.place_coin(s, lane, place, rules.coin_show_limit(values, first=False))
             self._draw_scenery(lane)
         return shown
 
     def _draw_scenery(self, lane: int) -> None:
         """Draws the lane's scenery again. Vectors need none; frames() draws it then."""
         if self.obs_type != "vector":
-            draw_scenery(self.state, self._drawing, lane)
+            drawing.draw_scenery(self.state, self._drawing, lane)
 
     def frames(self, lanes: Lanes) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3)."""
         if self.obs_type == "vector":
             for lane in np.arange(self.num_envs)[lanes].tolist():
-                draw_scenery(self.state, self._drawing, lane)
-        return draw(self.state, self._drawing, lanes)
+                drawing.draw_scenery(self.state, self._drawing, lane)
+        return drawing.draw(self.state, self._drawing, lanes)
 
     def vectors(self, lanes: Lanes) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32: see VARIANTS[id].entries."""
-        return make_vectors(self.state, self._vector_tables, lanes)
+        return vectors.make_vectors(self.state, self._vector_tables, lanes)
 
     def ground_truth(self) -> np.ndarray:
         """A fresh (N, 6), or (N, 4) in the endless id: the agent's, the coin's and the exit's x and y, over 84."""
@@ -286,7 +263,7 @@ class SearingSpotlights(WalkingVectorEnv):
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Lights everything below the bar, and circles the spotlights."""
         s, lanes = self.state, np.array([lane])
-        lit = draw_in_full_light(s, self._drawing, lanes, True)
+        lit = drawing.draw_in_full_light(s, self._drawing, lanes, True)
         below = slice(TOP_BAR * DEBUG_ZOOM, None)
         frame[below] = magnify(lit.reshape(SCREEN, SCREEN, 3), DEBUG_ZOOM)[below]
         for slot in np.flatnonzero(s.spot_place[0, lane]).tolist():
