@@ -10,15 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memory_gym_envs.character import FACINGS, PAD, SPAN, radius_of
+from memory_gym_envs.character import FACINGS, LARGEST_RADIUS, PAD, PIXELS, SPAN, radius_of
 from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.entries import Entries, vector_slices
 
-LARGEST_RADIUS = radius_of(1.0)
 UNSEEN = SPAN  # the position of an agent of which nothing shows, and its size
 # What entries say, by their code: stored positions, then UNSEEN, then sizes.
 BODY_SIZES = np.arange(1 + LARGEST_RADIUS) / LARGEST_RADIUS
-VALUES = np.concatenate([(np.arange(SPAN) - PAD) / SCREEN, BODY_SIZES]).astype(np.float32)
+VALUES = np.concatenate([PIXELS / SCREEN, BODY_SIZES]).astype(np.float32)
 FLAGS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little").astype(np.float32)
 HIDDEN = (UNSEEN, UNSEEN, UNSEEN, 0)  # the codes
 PLACE_STRIDES = np.array([1, SPAN])

@@ -183,16 +183,13 @@ class MortarMayhem(WalkingVectorEnv):
             rewards[lanes], sequence_over = rules.ignite_tiles(s, lanes)
             if self.variant.endless:
                 for lane in lanes[sequence_over].tolist():
-                    self._extend_sequence(lane)
+                    command = below(words(self._rngs[lane]), self.settings[lane]["allowed_commands"])
+                    rules.extend_sequence(s, lane, command)
+                    self._clues_open = True
             else:
                 # Whether or not the last command was carried out, as in the original; a failure overwrites the reward.
                 rewards[lanes] += s.reward_episode[lanes] * sequence_over
                 terminated[lanes] = sequence_over
-
-    def _extend_sequence(self, lane: int) -> None:
-        """Appends a random command to the lane's sequence."""
-        rules.extend_sequence(self.state, lane, below(words(self._rngs[lane]), self.settings[lane]["allowed_commands"]))
-        self._clues_open = True
 
     def pixels(self, lanes: Lanes) -> Any:
         """Fresh observations of the lanes with pixels, of the act task alone as a Dict."""

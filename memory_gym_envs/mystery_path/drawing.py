@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from memory_gym_envs.character import FACINGS, PAD, SPAN, radius_of
+from memory_gym_envs.character import FACINGS, PAD, PIXELS, SPAN, radius_of
 from memory_gym_envs.drawing import (
     BLUE,
     FRAME,
@@ -48,7 +48,7 @@ def tiles() -> Sheet:
     """Every kind of tile, to be pasted where a part of it may be off the screen."""
     colors = [(WHITE, GREY), (BLUE, BLUE), (GREEN, GREEN), (RED, RED), (GREY, GREY)]
     pictures = np.stack([tile_picture(TILE, *color) for color in colors])
-    return make_sheet(pictures, np.ones(pictures.shape[:3], bool), np.arange(SPAN) - PAD)
+    return make_sheet(pictures, np.ones(pictures.shape[:3], bool), PIXELS)
 
 
 def cross_mask() -> np.ndarray:
@@ -61,7 +61,7 @@ def cross_mask() -> np.ndarray:
 def crosses() -> Sheet:
     """The red cross."""
     picture = np.full((CROSS, CROSS, 3), RED, np.uint8)
-    return make_sheet(picture[None], cross_mask()[None], np.arange(SPAN) - PAD)
+    return make_sheet(picture[None], cross_mask()[None], PIXELS)
 
 
 @cache

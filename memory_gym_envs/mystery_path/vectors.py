@@ -8,16 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memory_gym_envs.appearance import (
-    CORNERS,
-    LARGEST_RADIUS,
-    AppearanceTables,
-    VectorTables,
-    View,
-    tables_of,
-    vector_tables,
-)
-from memory_gym_envs.character import FACINGS, PAD, SPAN, sprites
+from memory_gym_envs.appearance import CORNERS, AppearanceTables, VectorTables, View, tables_of, vector_tables
+from memory_gym_envs.character import FACINGS, LARGEST_RADIUS, PAD, PIXELS, SPAN, sprites
 from memory_gym_envs.drawing import RED, SCREEN
 from memory_gym_envs.mystery_path import drawing
 from memory_gym_envs.mystery_path.drawing import CROSS, STAMINA_BAR
@@ -26,7 +18,7 @@ from memory_gym_envs.mystery_path.state import State
 from memory_gym_envs.state import Lanes
 from memory_gym_envs.variant import Variant
 
-CROSS_ROW_FITS = abs(np.arange(SPAN) - PAD - SCREEN // 2) < (SCREEN + CROSS) // 2  # of stored positions along y
+CROSS_ROW_FITS = abs(PIXELS - SCREEN // 2) < (SCREEN + CROSS) // 2  # of stored positions along y
 
 
 class ViewOptions(NamedTuple):
@@ -119,11 +111,7 @@ def write_endless(
 
 
 def write_trail(
-    out: np.ndarray,
-    s: State,
-    lanes: Lanes,
-    appearance: AppearanceTables,
-    agent: tuple[np.ndarray, np.ndarray] | None,
+    out: np.ndarray, s: State, lanes: Lanes, appearance: AppearanceTables, agent: tuple[np.ndarray, np.ndarray] | None
 ) -> None:
     """Writes which tiles of the trails show, and their scroll. A tile shows if one of its corners does.
 

@@ -301,12 +301,7 @@ def overlay(
 
 
 def darken(
-    s: State,
-    lanes: Lanes,
-    frames: np.ndarray,
-    lit: np.ndarray,
-    rim: np.ndarray | None,
-    dim: np.ndarray,
+    s: State, lanes: Lanes, frames: np.ndarray, lit: np.ndarray, rim: np.ndarray | None, dim: np.ndarray
 ) -> None:
     """Darkens the lanes' frames, (n, FRAME), in place.
 

@@ -109,9 +109,9 @@ class SearingSpotlights(WalkingVectorEnv):
 
     def configure(self, lanes: np.ndarray) -> None:
         """Takes over the options of the lanes that mean more than a number, and makes room for the coins."""
-        values, endless = self.settings[int(lanes[0])], self.variant.endless
-        make_room(self.state, "B", COIN + (1 if endless else max((1, *values["num_coins"]))))
-        rules.set_rules(self.state, lanes, values, endless)
+        values = self.settings[int(lanes[0])]
+        make_room(self.state, "B", COIN + max((1, *values.get("num_coins", ()))))
+        rules.set_rules(self.state, lanes, values)
         drawing.set_pictures(self.state, lanes, values)
 
     def figures_of(self, values: dict[str, Any]) -> tuple[Figure, ...]:
@@ -120,7 +120,9 @@ class SearingSpotlights(WalkingVectorEnv):
 
     def place_tables(self) -> None:
         """The tables that step() looks things up in, and where each lane's rows start in them."""
-        self.scales, scale = numbered([scales_of(values) for values in self.settings])
+        coins = [values["coin_scale"] for values in self.settings]
+        exits = [values.get("exit_scale", values["coin_scale"]) for values in self.settings]
+        self.scales, scale = numbered([*zip(coins, exits, strict=True)])
         self.state.coin_sprite[:] = np.multiply(scale, 3)
         every = [values[name] for values in self.settings for name in ("spot_min_radius", "spot_max_radius")]
         self._radii = int(min(every)), int(max(every))  # the smallest and the largest
@@ -137,8 +139,7 @@ class SearingSpotlights(WalkingVectorEnv):
     def vector_tables(self) -> vectors.VectorTables:
         """The tables of vector observations."""
         figure_scales = tuple(across.scale for across in self.figures[::2])
-        has_hands = [int(10 * values["agent_scale"]) > 0 for values in self.settings]
-        return vectors.make_vector_tables(self.state, self.variant, self._radii, figure_scales, self.scales, has_hands)
+        return vectors.make_vector_tables(self.state, self.variant, self._radii, figure_scales, self.scales)
 
     def begin(self, lanes: np.ndarray) -> None:
         """Samples the lanes' next levels and starts their episodes."""
@@ -272,8 +273,3 @@ class SearingSpotlights(WalkingVectorEnv):
             circle = ring(len(frame), x * DEBUG_ZOOM, y * DEBUG_ZOOM, radius * DEBUG_ZOOM, DEBUG_ZOOM)
             circle[: TOP_BAR * DEBUG_ZOOM] = False
             frame[circle] = GREEN
-
-
-def scales_of(values: dict[str, Any]) -> tuple[float, float]:
-    """The scales of coin and exit."""
-    return values["coin_scale"], values.get("exit_scale", values["coin_scale"])

@@ -28,11 +28,11 @@ from memory_gym_envs.searing_spotlights.state import (
 from memory_gym_envs.state import make_room
 
 
-def set_rules(s: State, lanes: np.ndarray, values: dict[str, Any], endless: bool) -> None:
+def set_rules(s: State, lanes: np.ndarray, values: dict[str, Any]) -> None:
     """Writes what the options mean for the rules to the state of these lanes, (n,)."""
-    s.coin_limit[lanes] = values["steps_per_coin"] if endless and values["coin_enabled"] else -1
-    waits = ("spawn_interval",) if endless else ("initial_spawn_interval", "spawn_interval_threshold")
-    s.spawn_interval[lanes] = max(1, sum(values[name] for name in waits))
+    s.coin_limit[lanes] = values["steps_per_coin"] if values.get("coin_enabled") else -1
+    waits = ("spawn_interval", "initial_spawn_interval", "spawn_interval_threshold")
+    s.spawn_interval[lanes] = max(1, sum(values.get(name, 0) for name in waits))
     radius = radius_of(values["agent_scale"])
     coin, exit_ = int(10 * values["coin_scale"]), 10 * values.get("exit_scale", 0.0)
     s.touch_squared[lanes, COIN:], s.touch_squared[lanes, EXIT] = (coin + radius) ** 2, (exit_ + radius) ** 2

@@ -76,12 +76,11 @@ def make_vector_tables(
     radii: tuple[int, int],
     figure_scales: tuple[float, ...],
     scales: tuple[tuple[float, float], ...],
-    has_hands: list[bool],
 ) -> VectorTables:
     """The tables for the lanes of this state.
 
     radii: the smallest and the largest spotlight. figure_scales: of each two figures, which State.figure numbers.
-    scales: of coin and exit, for each three sprites, which State.coin_sprite numbers. has_hands: of each lane.
+    scales: of coin and exit, for each three sprites, which State.coin_sprite numbers.
     """
     first, coins = radii[1] + 1, s.bodies.shape[2] - COIN
     agent = first + s.figure // 2 * FACINGS  # (N,) each
@@ -105,7 +104,7 @@ def make_vector_tables(
         key=np.stack(key) * PLACES + PLACE_0,
         bodies=np.array(bodies),
         coin=1 if variant.endless else COIN,
-        has_hands=np.array(has_hands),
+        has_hands=np.array([int(10 * scale) > 0 for scale in figure_scales])[s.figure // 2],
     )
 
 
