@@ -46,14 +46,14 @@ wrong options raise ValueError.
 |---|---|---|
 | `render_mode` | None | "rgb_array": what the agent sees; "debug_rgb_array": 336 x 336, with the ground truth |
 | `num_levels`, `start_level` | None, 0 | resets without a seed play one of so many levels, from the first on |
-| `obs_type` | "pixels" | or "grayscale": one channel; or "vector" |
+| `obs_type` | "pixels" | or "grayscale": pictures (84, 84, 1); or "vector": float32 (V,), `VARIANTS[id].entries` |
 | `action_type` | "native" | or "discrete": one number of nine instead of two of three |
 | `options` | None | reset parameters that are the environment's defaults |
 | `max_episode_steps` | None | truncates longer episodes |
 | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
 
 `reset(options={...})` takes the same reset parameters, a single environment for one episode. `docs/options.md` and
-`VARIANTS[id].options` list them. Of a list, one entry is sampled at every reset.
+`VARIANTS[id].options` list them. Of a list, one entry is sampled at every reset. `docs/vectors.md` describes vectors.
 
 ## References
 

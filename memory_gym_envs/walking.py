@@ -9,18 +9,9 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
+from memory_gym_envs import character
 from memory_gym_envs.base import MemoryGymVectorEnv
-from memory_gym_envs.character import (
-    PAD,
-    SPAN,
-    STRIDES,
-    Figure,
-    agent_tables,
-    free_controls,
-    grid_controls,
-    radius_of,
-    walk,
-)
+from memory_gym_envs.character import PAD, SPAN, STRIDES, Figure
 from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.state import array
 
@@ -76,7 +67,7 @@ class WalkingVectorEnv(MemoryGymVectorEnv):
         scale = self.scale_of(values)
         if self.variant.grid:
             return Figure(scale, self.tile, low, high, self.tile // 2, False)
-        return Figure(scale, values["agent_speed"], low, high, radius_of(scale), torus)
+        return Figure(scale, values["agent_speed"], low, high, character.radius_of(scale), torus)
 
     def place_tables(self) -> None:
         """Looks up the tables that follow from the options, and where each lane's rows start in them."""
@@ -84,8 +75,8 @@ class WalkingVectorEnv(MemoryGymVectorEnv):
         self.figures = tuple(figure for each in every for figure in each)  # the different ones of all lanes
         axes = np.arange(len(every[0]))
         self.state.figure[:] = np.multiply(numbers, len(axes))
-        self._agent_tables = agent_tables(self.figures)
-        self._controls = grid_controls() if self.variant.grid else free_controls()
+        self._agent_tables = character.agent_tables(self.figures)
+        self._controls = character.grid_controls() if self.variant.grid else character.free_controls()
         self._lane_walk = (self.state.figure[:, None] + axes) * (STRIDES * SPAN)  # (N, 1) or (N, 2)
         if self.obs_type == "vector":
             self._vector_tables = self.vector_tables()
@@ -103,8 +94,8 @@ class WalkingVectorEnv(MemoryGymVectorEnv):
 
     def move_agents(self, action: np.ndarray) -> None:
         """Turns and moves the agents. action: (N,)."""
-        s = self.state
-        s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._agent_tables.walk)
+        s, table = self.state, self._agent_tables.walk
+        s.facing, s.pos = character.walk(s.facing, s.pos, action, self._lane_walk, self._controls, table)
 
     def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
         """The lanes' ended episodes in numbers, each (n,). A family adds its own."""

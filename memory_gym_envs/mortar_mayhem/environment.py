@@ -50,8 +50,7 @@ class MortarMayhem(WalkingVectorEnv):
 
     `Box(0, 255, (84, 84, 3), uint8)`, rows first. The B ids: `Dict` of `visual_observation`, that Box, and
     `vector_observation` (180,) float32: 20 commands by 9 one-hot entries in the order of VECTOR_ORDER, zeros after the
-    last command. With obs_type="grayscale", pictures have one channel: (84, 84, 1). With obs_type="vector", a flat
-    float32 vector without a picture: `docs/vectors.md`, `VARIANTS[id].entries`.
+    last command. Other values of `obs_type` change that: see Arguments.
 
     ## Rewards
 

@@ -11,16 +11,7 @@ from memory_gym_envs.character import PAD, Figure, radius_of
 from memory_gym_envs.drawing import SCREEN, magnify
 from memory_gym_envs.mystery_path import drawing, levels, rules, vectors
 from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE, VARIANTS
-from memory_gym_envs.mystery_path.state import (
-    MAP_STRIDES,
-    NO_CELL,
-    PIT,
-    PIT_ROWS,
-    ROWS,
-    State,
-    make_path_room,
-    tiles_of,
-)
+from memory_gym_envs.mystery_path.state import MAP_STRIDES, NO_CELL, PIT, PIT_ROWS, ROWS, State, tiles_of
 from memory_gym_envs.state import Lanes, empty
 from memory_gym_envs.walking import WalkingVectorEnv, numbered
 
@@ -51,8 +42,7 @@ class MysteryPath(WalkingVectorEnv):
 
     ## Observation Space
 
-    With obs_type="pixels" `Box(0, 255, (84, 84, 3), uint8)`, rows first; with "grayscale" the same with one channel,
-    (84, 84, 1); with "vector" a flat float32 vector, which `docs/vectors.md` and `VARIANTS[id].entries` describe.
+    `Box(0, 255, (84, 84, 3), uint8)`, rows first. Other values of `obs_type` change that: see Arguments.
 
     ## Rewards
 
@@ -141,9 +131,8 @@ class MysteryPath(WalkingVectorEnv):
         rules.forget_trails(self.state, lanes)
         for lane in lanes.tolist():
             level = levels.sample_level(self._rngs[lane], self.settings[lane], self.variant)
-            if make_path_room(self.state, len(level.path), len(level.walls)):
+            if levels.write_level(self.state, lane, level, self.variant.endless):
                 self._place_lanes()
-            levels.write_level(self.state, lane, level, self.variant.endless)
 
     def apply_rules(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Walks, and enters a tile or falls off: rewards and terminations, (N,) each."""

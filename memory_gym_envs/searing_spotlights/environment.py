@@ -40,8 +40,7 @@ class SearingSpotlights(WalkingVectorEnv):
 
     ## Observation Space
 
-    `Box(0, 255, (84, 84, 3), uint8)`, rows first. With obs_type="grayscale" the same pictures in one channel,
-    (84, 84, 1). With obs_type="vector" a flat float32 vector: `docs/vectors.md`, `VARIANTS[id].entries`.
+    `Box(0, 255, (84, 84, 3), uint8)`, rows first. Other values of `obs_type` change that: see Arguments.
 
     ## Rewards
 
