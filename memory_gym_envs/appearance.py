@@ -117,13 +117,11 @@ class VectorTables(NamedTuple):
     lane_sprite: np.ndarray  # (N,) the first sprite of the lane's agent in them
     large: bool  # whether some agent is wider than a tile, and so may hide one
 
-    def of_agents(self, sprite: np.ndarray, pos: np.ndarray) -> np.ndarray:
-        """Fresh vectors (n, V) of agents with these sprites (n,) at these positions (n, 2), other entries 0."""
-        out = np.zeros((len(sprite), self.width), np.float32)
+    def write_agents(self, out: np.ndarray, sprite: np.ndarray, pos: np.ndarray) -> None:
+        """Writes the entries of the agents with these sprites (n,) at these positions (n, 2) to out, (n, V)."""
         codes = self.appearance.codes.take(sprite * (SPAN * SPAN) + pos.dot(PLACE_STRIDES), axis=0)  # (n, 4)
         out[:, :3] = VALUES.take(codes[:, :3])
         out[:, 3 : 3 + FACINGS] = FLAGS.take(codes[:, 3], axis=0)
-        return out
 
 
 def vector_tables(

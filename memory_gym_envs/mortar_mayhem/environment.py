@@ -18,7 +18,7 @@ from memory_gym_envs.state import Lanes, empty, make_room
 from memory_gym_envs.walking import WalkingVectorEnv
 from memory_gym_envs.words import below, words
 
-EVERY_LANE: Any = np.True_  # a mask for when all lanes act
+EVERY_LANE: Any = np.True_  # a mask for when no clue is shown, so that all lanes act
 
 
 class MortarMayhem(WalkingVectorEnv):
@@ -151,8 +151,12 @@ class MortarMayhem(WalkingVectorEnv):
         """Shows clues, moves the agents and changes the tiles: rewards and terminations, (N,) each."""
         s = self.state
         rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, bool)
-        acting = self._acting_lanes()
-        if np.count_nonzero(acting):
+        acting, count = EVERY_LANE, self.num_envs
+        if self._clues_open:
+            acting = rules.show_clue(s, self._lane_clue)  # (N,) bool
+            count = int(np.count_nonzero(acting))
+            self._clues_open = count < self.num_envs
+        if count:
             if acting is not EVERY_LANE:
                 action = np.where(acting, action, self._controls.actions - 1)
             self.move_agents(action)
@@ -162,14 +166,6 @@ class MortarMayhem(WalkingVectorEnv):
                 self._change_tiles(due.nonzero()[0], rewards, terminated)
             rules.burn_agents(s, acting, rewards, terminated)
         return rewards, terminated
-
-    def _acting_lanes(self) -> np.ndarray:
-        """Shows the clues' next step. Which lanes may act: (N,) bool, or EVERY_LANE while no clue is shown."""
-        if not self._clues_open:
-            return EVERY_LANE
-        acting = rules.show_clue(self.state, self._lane_clue)
-        self._clues_open = bool(np.count_nonzero(acting) < self.num_envs)
-        return acting
 
     def _change_tiles(self, lanes: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
         """Puts out the lanes' tiles that burn, and lights those that do not, which checks the command."""

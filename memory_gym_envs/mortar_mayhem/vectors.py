@@ -59,15 +59,16 @@ def floor_entries() -> np.ndarray:
 
 def make_vectors(s: State, tables: VectorTables, lanes: Lanes) -> np.ndarray:
     """Fresh vector observations of the lanes, (n, V) float32."""
-    at, has_clue = tables.at, "command" in tables.at
-    sprite, symbol = tables.lane_sprite[lanes] + s.facing[lanes], s.symbol[lanes]  # (n,) each
-    if has_clue:
+    at = tables.at
+    sprite = tables.lane_sprite[lanes] + s.facing[lanes]  # (n,)
+    out = np.empty((len(sprite), tables.width), np.float32)
+    if "command" in at:
+        symbol = s.symbol[lanes]
         sprite += symbol * FACINGS
-    out = tables.of_agents(sprite, s.pos[lanes])
-    if has_clue:
         out[:, at["command"]] = COMMAND_ENTRIES.take(symbol, axis=0)
     else:
         out[:, at["commands"]] = s.vector[lanes]
+    tables.write_agents(out, sprite, s.pos[lanes])
     floor = out[:, at["arena"].start : at["safe"].stop]  # (n, 4)
     floor[:] = floor_entries().take(s.floor[lanes], axis=0)
     if tables.large:

@@ -74,7 +74,8 @@ def make_vectors(s: State, tables: VectorTables, lanes: Lanes, endless: bool) ->
     """Fresh vector observations of the lanes, (n, V) float32."""
     at, shows_cross, pos = tables.at, s.shows_cross[lanes], drawing.place_on_screen(s, lanes, endless)
     sprite = tables.lane_sprite[lanes] + shows_cross * FACINGS + s.facing[lanes]  # (n,)
-    out = tables.of_agents(sprite, pos)
+    out = np.zeros((len(sprite), tables.width), np.float32)
+    tables.write_agents(out, sprite, pos)
     if endless:
         write_endless(out, s, tables, lanes, sprite, pos)
     else:
