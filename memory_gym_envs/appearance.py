@@ -2,22 +2,22 @@
 
 The screen's edge, a symbol or a cross may hide so much of an agent that several places and facings look the same. The
 tables made here say which, so that a vector observation knows no more than who sees the frame.
-Shape letters: R sprites (the facings of all views), W a sprite's width, P stored positions along one axis, n agents.
+Shape letters: R sprites (the facings of all views), W a sprite's width, P stored positions along one axis, N lanes, n
+some of them, V entries of a vector.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from memory_gym_envs.character import FACINGS, PAD, SPAN, radius_of
+from memory_gym_envs.character import FACINGS, LARGEST_RADIUS, PAD, PIXELS, SPAN, radius_of
 from memory_gym_envs.drawing import SCREEN
-from memory_gym_envs.entries import Entries
+from memory_gym_envs.entries import Entries, vector_slices
 
-LARGEST_RADIUS = radius_of(1.0)
 UNSEEN = SPAN  # the position of an agent of which nothing shows, and its size
 # What entries say, by their code: stored positions, then UNSEEN, then sizes.
 BODY_SIZES = np.arange(1 + LARGEST_RADIUS) / LARGEST_RADIUS
-VALUES = np.concatenate([(np.arange(SPAN) - PAD) / SCREEN, BODY_SIZES]).astype(np.float32)
+VALUES = np.concatenate([PIXELS / SCREEN, BODY_SIZES]).astype(np.float32)
 FLAGS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little").astype(np.float32)
 HIDDEN = (UNSEEN, UNSEEN, UNSEEN, 0)  # the codes
 PLACE_STRIDES = np.array([1, SPAN])
@@ -25,7 +25,7 @@ CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # (4, 2) of a square, in u
 
 
 def agent_entries(low: int, high: int) -> tuple[Entries, ...]:
-    """What `write_agent_entries` writes, for agents whose centre stays between these pixels on both axes."""
+    """The first entries of a vector, for agents whose centre stays between these pixels on both axes."""
     size = f"radius of the agent's body, / {LARGEST_RADIUS} pixels; 0: none of it is visible"
     place = "the agent's centre, x and y, / 84 pixels; the middle of all places that would look the same"
     facing = "the agent's facing, one-hot; 1 for each that would look the same"
@@ -50,8 +50,14 @@ class AppearanceTables(NamedTuple):
     codes: np.ndarray  # (R * P * P, 4) uint8: codes of size, x and y, and the facings as bits
     solid: np.ndarray  # (R, W + 2, W + 2) bool: the sprites with a transparent rim
 
+    def covered(self, sprite: np.ndarray, pos: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Which pixels lie under the agents: (n, k) bool for points (n, k, 2), x and y with PAD."""
+        width = self.solid.shape[1]
+        place = (points - pos[:, None] + width // 2).clip(0, width - 1)
+        return self.solid[sprite[:, None], place[..., 1], place[..., 0]]
 
-def make_appearance_tables(views: list[View]) -> AppearanceTables:
+
+def tables_of(views: list[View]) -> AppearanceTables:
     """Prepares the views."""
     width = max(view.solid.shape[1] for view in views) + 2
     solids = []
@@ -102,15 +108,26 @@ def appearance_hashes(view: View) -> np.ndarray:
     return hashes
 
 
-def write_agent_entries(out: np.ndarray, tables: AppearanceTables, sprite: np.ndarray, pos: np.ndarray) -> None:
-    """Writes the entries of the agents with these sprites (n,) at these positions (n, 2) to out, (n, 11)."""
-    codes = tables.codes.take(sprite * (SPAN * SPAN) + pos.dot(PLACE_STRIDES), axis=0)  # (n, 4)
-    out[:, :3] = VALUES.take(codes[:, :3])
-    out[:, 3:] = FLAGS.take(codes[:, 3], axis=0)
+class VectorTables(NamedTuple):
+    """What writing vectors needs besides the state."""
+
+    at: dict[str, slice]  # where the entries are in a vector; the agent's are the first
+    width: int  # V
+    appearance: AppearanceTables
+    lane_sprite: np.ndarray  # (N,) the first sprite of the lane's agent in them
+    large: bool  # whether some agent is wider than a tile, and so may hide one
+
+    def write_agents(self, out: np.ndarray, sprite: np.ndarray, pos: np.ndarray) -> None:
+        """Writes the entries of the agents with these sprites (n,) at these positions (n, 2) to out, (n, V)."""
+        codes = self.appearance.codes.take(sprite * (SPAN * SPAN) + pos.dot(PLACE_STRIDES), axis=0)  # (n, 4)
+        out[:, :3] = VALUES.take(codes[:, :3])
+        out[:, 3 : 3 + FACINGS] = FLAGS.take(codes[:, 3], axis=0)
 
 
-def covered(tables: AppearanceTables, sprite: np.ndarray, pos: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Which pixels lie under the agents: (n, k) bool for points (n, k, 2), x and y with PAD."""
-    width = tables.solid.shape[1]
-    place = (points - pos[:, None] + width // 2).clip(0, width - 1)
-    return tables.solid[sprite[:, None], place[..., 1], place[..., 0]]
+def vector_tables(
+    entries: tuple[Entries, ...], appearance: AppearanceTables, lane_sprite: np.ndarray, scales: list[float], tile: int
+) -> VectorTables:
+    """The tables for vectors of these entries, and agents of these sizes on tiles of so many pixels."""
+    at = vector_slices(entries)
+    large = any(2 * radius_of(scale) > tile for scale in scales)
+    return VectorTables(at, at[entries[-1].name].stop, appearance, lane_sprite, large)

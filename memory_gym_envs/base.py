@@ -23,7 +23,7 @@ from memory_gym_envs.entries import vector_space
 from memory_gym_envs.old_gymnasium import AutoresetMode, VectorEnv, warn_of_wrappers
 from memory_gym_envs.options import brief, complete_options
 from memory_gym_envs.saving import Saved, is_generator, plain, restored
-from memory_gym_envs.state import grows
+from memory_gym_envs.state import Lanes, grows, write_options
 from memory_gym_envs.variant import Variant
 
 RENDER_MODES = ("rgb_array", "debug_rgb_array")
@@ -46,14 +46,14 @@ wrong options raise ValueError.
 |---|---|---|
 | `render_mode` | None | "rgb_array": what the agent sees; "debug_rgb_array": 336 x 336, with the ground truth |
 | `num_levels`, `start_level` | None, 0 | resets without a seed play one of so many levels, from the first on |
-| `obs_type` | "pixels" | or "grayscale": one channel; or "vector" |
+| `obs_type` | "pixels" | or "grayscale": pictures (84, 84, 1); or "vector": float32 (V,), `VARIANTS[id].entries` |
 | `action_type` | "native" | or "discrete": one number of nine instead of two of three |
 | `options` | None | reset parameters that are the environment's defaults |
 | `max_episode_steps` | None | truncates longer episodes |
 | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
 
 `reset(options={...})` takes the same reset parameters, a single environment for one episode. `docs/options.md` and
-`VARIANTS[id].options` list them. Of a list, one entry is sampled at every reset.
+`VARIANTS[id].options` list them. Of a list, one entry is sampled at every reset. `docs/vectors.md` describes vectors.
 
 ## References
 
@@ -185,6 +185,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         self.ready = False
         self._over = np.zeros(self.num_envs, bool)  # lanes that wait for a reset; in the same-step mode, none does
         self.allocate()
+        self.place_tables()
 
     # ---- what a family provides ----
 
@@ -197,10 +198,13 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         raise NotImplementedError
 
     def configure(self, lanes: np.ndarray) -> None:
-        """Takes over `self.settings` of the lanes, whose options were just set by an explicit reset."""
+        """Takes over the lanes' new `self.settings`, except for options that an array of the state holds as it is."""
 
     def place_tables(self) -> None:
-        """Looks up the tables that follow from the options, and where each lane's rows start in them."""
+        """Looks up the tables that follow from the options, and where each lane's rows start in them.
+
+        Called after `allocate` and `configure`, and when a state is set.
+        """
 
     def begin(self, lanes: np.ndarray) -> None:
         """Builds the lanes' next levels, each from its generator in `self.np_random`, and starts their episodes."""
@@ -210,15 +214,15 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         """Applies the rules for one step: rewards, terminations, truncations, each (N,). Resets nothing."""
         raise NotImplementedError
 
-    def pixels(self, lanes: np.ndarray | slice) -> Any:
+    def pixels(self, lanes: Lanes) -> Any:
         """Fresh observations of the lanes with pixels, drawn from the state alone."""
         return self.frames(lanes)
 
-    def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
+    def vectors(self, lanes: Lanes) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32: lanes whose frames are equal have equal vectors."""
         raise NotImplementedError
 
-    def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
+    def frames(self, lanes: Lanes) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3) uint8: what the agent sees."""
         raise NotImplementedError
 
@@ -277,9 +281,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             raise gym.error.ResetNeeded("call reset() before step()")
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             return self._step_and_wait(self.checked_actions(actions))
-        rewards, terminated, truncated = self.advance(self.checked_actions(actions))
-        if self.max_episode_steps is not None:
-            truncated = self._limit(truncated)
+        rewards, terminated, truncated = self._advance(self.checked_actions(actions))
         observations, infos = self.observe(ALL), {}
         (ended,) = (terminated | truncated).nonzero()
         if ended.size:
@@ -289,7 +291,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         infos.update(self._truth_info(None))
         return observations, rewards, terminated, truncated, infos
 
-    def render(self, lanes: np.ndarray | slice = ALL) -> tuple[np.ndarray, ...] | None:
+    def render(self, lanes: Lanes = ALL) -> tuple[np.ndarray, ...] | None:
         """One picture per lane: (84, 84, 3), or (336, 336, 3) in the debug mode. None without a render mode."""
         if self.render_mode is None:
             gym.logger.warn("render() needs an environment that was made with render_mode, e.g. 'rgb_array'")
@@ -320,7 +322,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
 
     # ---- parts ----
 
-    def observe(self, lanes: np.ndarray | slice) -> Any:
+    def observe(self, lanes: Lanes) -> Any:
         """Fresh observations of the lanes, of the kind that the environment was made for."""
         if self.obs_type == "vector":
             return self.vectors(lanes)
@@ -401,13 +403,18 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         if not self.ready or any(self.settings[lane] != settings for lane in lanes.tolist()):
             for lane in lanes.tolist():
                 self.settings[lane] = settings
+            write_options(self.state, lanes, settings)
             self.configure(lanes)
+            self.place_tables()
         self._next_levels(lanes, seeds)
         self.ready = True
 
-    def _limit(self, truncated: np.ndarray) -> np.ndarray:
-        """(N,) truncated by `max_episode_steps` too: as Gymnasium's TimeLimit, whether or not they are terminated."""
-        return truncated | (self.state.length >= self.max_episode_steps)
+    def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`advance`, with truncations by `max_episode_steps`: as Gymnasium's TimeLimit, also of terminated episodes."""
+        rewards, terminated, truncated = self.advance(actions)
+        if self.max_episode_steps is not None:
+            truncated = truncated | (self.state.length >= self.max_episode_steps)
+        return rewards, terminated, truncated
 
     def _step_and_wait(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One step in which lanes that wait since the last one are reset, or have to have been, and others begin to."""
@@ -419,9 +426,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             # All lanes advance at once. These do it in a level that nobody sees, by generators that nobody needs.
             self._rngs = [np.random.default_rng(0) if over else rng for over, rng in zip(self._over, rngs, strict=True)]
             self.begin(waiting)
-        rewards, terminated, truncated = self.advance(actions)
-        if self.max_episode_steps is not None:
-            truncated = self._limit(truncated)
+        rewards, terminated, truncated = self._advance(actions)
         if waiting.size:
             self._rngs = rngs
             self._next_levels(waiting, [None] * self.num_envs)
@@ -484,16 +489,12 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
 
     def _final_info(self, ended: np.ndarray, observations: Any) -> dict[str, Any]:
         """final_obs and final_info of the lanes whose episode ended, as SyncVectorEnv lays them out."""
-        mask = np.zeros(self.num_envs, bool)
-        mask[ended] = True
         final_obs = np.empty(self.num_envs, object)
         for lane in ended.tolist():
             final_obs[lane] = one_of(observations, lane)
-        truth = self.ground_truth()
-        truth[~mask] = 0.0
-        final_info = self._summaries(ended)
-        final_info.update(ground_truth=truth, _ground_truth=mask.copy())
-        return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask.copy()}
+        final_info = {**self._summaries(ended), **self._truth_info(ended)}
+        mask = final_info["_ground_truth"]
+        return {"final_obs": final_obs, "_final_obs": mask.copy(), "final_info": final_info, "_final_info": mask.copy()}
 
     def _summaries(self, ended: np.ndarray) -> dict[str, np.ndarray]:
         """The ended episodes in numbers, each (N,) with its mask."""
@@ -502,17 +503,6 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
             infos[key], infos[f"_{key}"] = np.zeros(self.num_envs, values.dtype), np.zeros(self.num_envs, bool)
             infos[key][ended], infos[f"_{key}"][ended] = values, True
         return infos
-
-
-def numbered(every: list[Any]) -> tuple[tuple[Any, ...], list[int]]:
-    """The different ones among these, and for each which of them it is."""
-    different = tuple(dict.fromkeys(every))
-    return different, [different.index(each) for each in every]
-
-
-def limit_of(steps: int) -> int:
-    """The number of steps that an option allows, of which -1 means any."""
-    return NO_LIMIT if steps == -1 else steps
 
 
 def lane_seeds(seed: Any, num_envs: int) -> list[int | None]:

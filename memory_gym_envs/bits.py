@@ -38,7 +38,8 @@ class Stencils(NamedTuple):
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The pictures at these keys, (...), as 64-bit words: (..., words) uint64."""
-        return as_words(self.windows[self.column.take(x) + self.row.take(y)])
+        pictures = self.windows[self.column.take(x) + self.row.take(y)]
+        return pictures.view(np.uint64).reshape(*pictures.shape, pictures.itemsize // 8)
 
 
 def stencils(shapes: Sequence[np.ndarray], height: int = SCREEN) -> Stencils:
@@ -106,11 +107,6 @@ def row_windows(strip: np.ndarray, height: int) -> np.ndarray:
     """Every window of so many rows of a strip (rows, items), by its first row: one opaque item each, a view."""
     size = strip.shape[1] * strip.itemsize
     return np.ndarray((len(strip) - height + 1,), np.dtype(f"V{size * height}"), strip, 0, (size,))
-
-
-def as_words(views: np.ndarray) -> np.ndarray:
-    """Opaque items, (...), as 64-bit words (..., words) uint64."""
-    return views.view(np.uint64).reshape(*views.shape, views.itemsize // 8)
 
 
 @cache

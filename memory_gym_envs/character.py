@@ -14,6 +14,7 @@ from memory_gym_envs.drawing import SCREEN, Sheet, disk, make_sheet, ring
 
 PAD = 25  # the radius of the largest agent, of which nothing shows at position 0
 SPAN = 137  # stored positions are 0 .. SPAN-1
+PIXELS = np.arange(SPAN) - PAD  # what they stand for
 FACINGS = 8
 BODY, HAND, HAND_OUTLINE = (250, 204, 153), (250, 250, 250), (50, 50, 50)
 
@@ -36,6 +37,9 @@ class Figure(NamedTuple):
 def radius_of(scale: float) -> int:
     """The body's radius in pixels."""
     return int(25 * scale)
+
+
+LARGEST_RADIUS = radius_of(1.0)
 
 
 class Controls(NamedTuple):
@@ -75,19 +79,18 @@ def grid_controls() -> Controls:
 
 def walk_table(figure: Figure) -> np.ndarray:
     """(STRIDES * SPAN,) the next stored position for every stride and every stored position."""
-    here = np.arange(SPAN) - PAD
     straight = figure.speed
     diagonal = 1 / math.sqrt(2) * figure.speed  # not sqrt(1/2), which differs in the last bit
     steps = np.array([0.0, -straight, straight, -diagonal, diagonal])  # STAND .. DIAGONAL_FORTH
     if figure.torus:
         # The original rounds the new position here, where it cuts the step off on bounded ground.
-        there = _round(here + steps[:, None])  # (5, SPAN)
+        there = _round(PIXELS + steps[:, None])  # (5, SPAN)
         before, behind = figure.low - figure.reach / 2, figure.high + figure.reach / 2
         there = np.where(there > behind, _round(before), np.where(there < before, _round(behind), there))
     else:
-        there = here + np.trunc(steps)[:, None]  # (5, SPAN)
+        there = PIXELS + np.trunc(steps)[:, None]  # (5, SPAN)
         there = np.maximum(np.minimum(there, figure.high - figure.reach), figure.low + figure.reach)
-    table = np.concatenate([here[None], there]).astype(np.int64) + PAD  # (STRIDES, SPAN), first FROZEN
+    table = np.concatenate([PIXELS[None], there]).astype(np.int64) + PAD  # (STRIDES, SPAN), first FROZEN
     return table.clip(0, SPAN - 1).reshape(-1)
 
 
@@ -147,22 +150,16 @@ def agent_tables(figures: tuple[Figure, ...]) -> AgentTables:
         around = ((0, 0), (margin, margin), (margin, margin))
         images.append(np.pad(image, (*around, (0, 0))))
         solids.append(np.pad(solid, around))
-    positions = np.arange(SPAN) - PAD
-    return AgentTables(walk, make_sheet(np.concatenate(images), np.concatenate(solids), positions))
+    return AgentTables(walk, make_sheet(np.concatenate(images), np.concatenate(solids), PIXELS))
 
 
 def walk(
-    facing: np.ndarray,
-    pos: np.ndarray,
-    action: np.ndarray,
-    lane_walk: np.ndarray,
-    controls: Controls,
-    table: np.ndarray,
+    facing: np.ndarray, pos: np.ndarray, action: np.ndarray, start: np.ndarray, controls: Controls, table: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """One step of all figures: the new facings (N,) and positions (N, 2).
 
     action: (N,) controls.actions - 1 for agents that may not move.
-    lane_walk: (N, 1) where the lane's walk table starts.
+    start: (N, 1) where the lane's walk table starts.
     """
     key = facing * controls.actions + action
-    return controls.turn.take(key), table.take(controls.strides.take(key, axis=0) + lane_walk + pos)
+    return controls.turn.take(key), table.take(controls.strides.take(key, axis=0) + start + pos)

@@ -3,6 +3,7 @@
 Frames are (n, 84, 84, 3) uint8, rows first: frames[i, y, x]. Masks are (height, width) bool.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -70,6 +71,14 @@ def turned(mask: np.ndarray, degrees: float, size: int) -> np.ndarray:
     source_y = np.floor(x * sin + y * cos + old / 2).astype(int)
     inside = (source_x >= 0) & (source_x < old) & (source_y >= 0) & (source_y < old)
     return inside & mask[source_y.clip(0, old - 1), source_x.clip(0, old - 1)]
+
+
+@cache
+def tile_picture(width: int, inside: tuple[int, int, int], edge: tuple[int, int, int]) -> np.ndarray:
+    """(W, W, 3) uint8, read-only: a tile with an edge of one pixel."""
+    picture = np.full((width, width, 3), edge, np.uint8)
+    picture[1:-1, 1:-1] = inside
+    return read_only(picture)
 
 
 class Sheet(NamedTuple):

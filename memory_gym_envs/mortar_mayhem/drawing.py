@@ -9,9 +9,10 @@ import numpy as np
 
 from memory_gym_envs.base import DEBUG_ZOOM
 from memory_gym_envs.character import FACINGS, PAD
-from memory_gym_envs.drawing import GREEN, ROW, SCREEN, Sheet, paste, read_only, ring, turned
+from memory_gym_envs.drawing import GREEN, ROW, SCREEN, Sheet, paste, read_only, ring, tile_picture, turned
 from memory_gym_envs.mortar_mayhem.arena import COMMANDS, FLOORS, TILE, first_pixel
 from memory_gym_envs.mortar_mayhem.state import State
+from memory_gym_envs.state import Lanes
 
 CALM_TILE, CALM_EDGE = (21, 43, 77), (29, 60, 107)  # blue
 BURNING_TILE, BURNING_EDGE = (81, 18, 26), (112, 24, 36)  # red
@@ -21,7 +22,7 @@ SYMBOL, SYMBOL_AT = 24, 31  # width of the symbols' square, and its first pixel 
 @cache
 def floors() -> np.ndarray:
     """(F, FRAME) uint8, read-only: the pictures of FLOORS, without an agent."""
-    calm, burning = tile_picture(CALM_TILE, CALM_EDGE), tile_picture(BURNING_TILE, BURNING_EDGE)
+    calm, burning = tile_picture(TILE, CALM_TILE, CALM_EDGE), tile_picture(TILE, BURNING_TILE, BURNING_EDGE)
     table = np.zeros((len(FLOORS), SCREEN, SCREEN, 3), np.uint8)
     for frame, (size, safe) in zip(table, FLOORS, strict=True):
         for x in range(size):
@@ -29,13 +30,6 @@ def floors() -> np.ndarray:
                 top, left = first_pixel(size) + TILE * y, first_pixel(size) + TILE * x
                 frame[top : top + TILE, left : left + TILE] = calm if safe in (None, (x, y)) else burning
     return read_only(table.reshape(len(FLOORS), -1))
-
-
-def tile_picture(inside: tuple[int, int, int], edge: tuple[int, int, int]) -> np.ndarray:
-    """(TILE, TILE, 3) uint8: a tile with an edge of one pixel."""
-    picture = np.full((TILE, TILE, 3), edge, np.uint8)
-    picture[1:-1, 1:-1] = inside
-    return picture
 
 
 @cache
@@ -64,7 +58,7 @@ def arrow_mask() -> np.ndarray:
     return head | ((rows >= 10) & (rows <= 11) & (columns <= 20))
 
 
-def draw(s: State, sheet: Sheet, lanes: np.ndarray | slice) -> np.ndarray:
+def draw(s: State, sheet: Sheet, lanes: Lanes) -> np.ndarray:
     """Fresh frames of the lanes, (n, 84, 84, 3) uint8, from the state alone."""
     frames = floors().take(s.floor[lanes], axis=0)  # (n, FRAME)
     paste(frames, sheet, s.figure[lanes] * FACINGS + s.facing[lanes], s.pos[lanes])

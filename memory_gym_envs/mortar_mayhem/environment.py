@@ -8,40 +8,20 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import MemoryGymVectorEnv, limit_of, numbered
-from memory_gym_envs.character import (
-    PAD,
-    SPAN,
-    STRIDES,
-    Figure,
-    agent_tables,
-    free_controls,
-    grid_controls,
-    radius_of,
-    walk,
-)
-from memory_gym_envs.drawing import SCREEN
+from memory_gym_envs.character import Figure
+from memory_gym_envs.mortar_mayhem import drawing, levels, rules, vectors
 from memory_gym_envs.mortar_mayhem.arena import COMMANDS, FLOORS, TILE, TORUS_SIZE, first_pixel
-from memory_gym_envs.mortar_mayhem.drawing import circle_target, draw
-from memory_gym_envs.mortar_mayhem.levels import sample_level, write_level
 from memory_gym_envs.mortar_mayhem.options import VARIANTS, VECTOR_COMMANDS, MortarVariant
-from memory_gym_envs.mortar_mayhem.rules import (
-    burn_agents,
-    extend_sequence,
-    extinguish_tiles,
-    ignite_tiles,
-    on_target,
-    show_clue,
-)
 from memory_gym_envs.mortar_mayhem.state import State
-from memory_gym_envs.mortar_mayhem.vectors import make_vector_tables, make_vectors
-from memory_gym_envs.state import empty, make_room
+from memory_gym_envs.mortar_mayhem.vectors import VectorTables
+from memory_gym_envs.state import Lanes, empty, make_room
+from memory_gym_envs.walking import WalkingVectorEnv
 from memory_gym_envs.words import below, words
 
-EVERY_LANE: Any = np.True_  # a mask for when all lanes act
+EVERY_LANE: Any = np.True_  # a mask for when no clue is shown, so that all lanes act
 
 
-class MortarMayhem(MemoryGymVectorEnv):
+class MortarMayhem(WalkingVectorEnv):
     """Mortar Mayhem (thesis 4.3): memorise a sequence of commands, then carry them out in time.
 
     ## Description
@@ -58,22 +38,11 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     ## Action Space
 
-    `MultiDiscrete([3, 3])`:
-
-    | value | horizontal | vertical |
-    |---|---|---|
-    | 0 | none | none |
-    | 1 | left | up |
-    | 2 | right | down |
-
-    `Discrete(4)`, Grid ids:
-
-    | value | action |
-    |---|---|
-    | 0 | nothing |
-    | 1 | turn left |
-    | 2 | turn right |
-    | 3 | one tile forward |
+    | space | 0 | 1 | 2 | 3 |
+    |---|---|---|---|---|
+    | `MultiDiscrete([3, 3])`, horizontal | none | left | right | |
+    | and vertical | none | up | down | |
+    | `Discrete(4)`, Grid ids | nothing | turn left | turn right | one tile forward |
 
     Actions are ignored while a clue is shown.
 
@@ -81,8 +50,7 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     `Box(0, 255, (84, 84, 3), uint8)`, rows first. The B ids: `Dict` of `visual_observation`, that Box, and
     `vector_observation` (180,) float32: 20 commands by 9 one-hot entries in the order of VECTOR_ORDER, zeros after the
-    last command. With obs_type="grayscale", pictures have one channel: (84, 84, 1). With obs_type="vector", a flat
-    float32 vector without a picture: `docs/vectors.md`, `VARIANTS[id].entries`.
+    last command. Other values of `obs_type` change that: see Arguments.
 
     ## Rewards
 
@@ -129,140 +97,109 @@ class MortarMayhem(MemoryGymVectorEnv):
     """
 
     variants = VARIANTS
-    tables = ("_agent_tables", "_vector_tables")
-    kept = (*MemoryGymVectorEnv.kept, "_clues_open")
+    tile = TILE
+    kept = (*WalkingVectorEnv.kept, "_clues_open")
     variant: MortarVariant
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
-        """The observation space of one lane with pixels, and its action space."""
-        image = gym.spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8)
+        """The observation space of one lane with pixels, of the act task alone a Dict, and its action space."""
+        image, actions = super().spaces()
+        if self.variant.clue:
+            return image, actions
         vector = gym.spaces.Box(0.0, 1.0, (VECTOR_COMMANDS * len(COMMANDS),), np.float32)
-        both = gym.spaces.Dict({"visual_observation": image, "vector_observation": vector})
-        actions = gym.spaces.Discrete(4) if self.variant.grid else gym.spaces.MultiDiscrete([3, 3])
-        return image if self.variant.clue else both, actions
+        return gym.spaces.Dict({"visual_observation": image, "vector_observation": vector}), actions
 
     def allocate(self) -> None:
         """Makes the state of N lanes."""
         self.state = empty(State, N=self.num_envs, C=1, L=1)
-        self.figures = (self._figure(self.defaults),)  # the different ones of all lanes
         self._clues_open = False  # whether any lane may still have a clue to see
-        self.place_tables()
 
     def configure(self, lanes: np.ndarray) -> None:
-        """Takes over the options of the lanes, and the tables that all lanes' options need."""
-        s, variant, values = self.state, self.variant, self.settings[int(lanes[0])]
-        count = values["initial_command_count"] if variant.endless else max(values["command_count"])
+        """Takes over the arena, and makes room for the commands and for their clue."""
+        s, values = self.state, self.settings[int(lanes[0])]
+        count = values["initial_command_count"] if self.variant.endless else max(values["command_count"])
         make_room(s, "C", count + 1)
-        if variant.clue:
+        if self.variant.clue:
             period = max(values["command_show_duration"]) + max(values["command_show_delay"])
             make_room(s, "L", count * period + 1)
-        size = values.get("arena_size", TORUS_SIZE)
-        s.size[lanes] = size
+        s.size[lanes] = size = values.get("arena_size", TORUS_SIZE)
         s.calm_floor[lanes] = FLOORS.index((size, None))
-        s.visual_feedback[lanes] = values["visual_feedback"]
-        s.reward_success[lanes] = values["reward_command_success"]
-        s.reward_failure[lanes] = values["reward_command_failure"]
-        s.reward_episode[lanes] = values.get("reward_episode_success", 0.0)
-        s.reward_new_command[lanes] = values.get("reward_new_command_success", 0.0)
-        s.step_limit[lanes] = limit_of(values.get("max_steps", -1))
-        self.figures, s.figure[:] = numbered([self._figure(each) for each in self.settings])
-        self.place_tables()
 
-    def _figure(self, values: dict[str, Any]) -> Figure:
+    def figures_of(self, values: dict[str, Any]) -> tuple[Figure, ...]:
         """The agent's figure under these options."""
         size = values.get("arena_size", TORUS_SIZE)
-        low, high = first_pixel(size), first_pixel(size) + TILE * size
-        if self.variant.grid:
-            return Figure(0.25, TILE, low, high, TILE // 2, False)
-        scale = values["agent_scale"]
-        return Figure(scale, values["agent_speed"], low, high, radius_of(scale), self.variant.endless)
+        low = first_pixel(size)
+        return (self.figure_of(values, low, low + TILE * size, torus=self.variant.endless),)
 
     def place_tables(self) -> None:
         """Looks up the tables that follow from the options, and where each lane's rows start in them."""
-        self._agent_tables = agent_tables(self.figures)
-        self._controls = grid_controls() if self.variant.grid else free_controls()
-        self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
+        super().place_tables()
         self._lane_clue = np.arange(self.num_envs) * self.state.clue.shape[1]  # (N,)
-        if self.obs_type == "vector":
-            self._vector_tables = make_vector_tables(self.variant, self.figures, self.state.figure)
+
+    def vector_tables(self) -> VectorTables:
+        """The tables of vector observations."""
+        return vectors.make_vector_tables(self.variant, self.figures, self.state.figure)
 
     def begin(self, lanes: np.ndarray) -> None:
         """Samples the lanes' next levels and starts their episodes."""
         for lane in lanes.tolist():
-            level = sample_level(self._rngs[lane], self.settings[lane], self.variant)
-            write_level(self.state, lane, level, self.variant)
+            level = levels.sample_level(self._rngs[lane], self.settings[lane], self.variant)
+            levels.write_level(self.state, lane, level, self.variant)
         self._clues_open = self.variant.clue
 
-    def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Applies the rules for one step: rewards, terminations, truncations, each (N,)."""
+    def apply_rules(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Shows clues, moves the agents and changes the tiles: rewards and terminations, (N,) each."""
         s = self.state
         rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, bool)
-        s.length += 1
-        acting = self._acting_lanes()
-        if np.count_nonzero(acting):
-            self._move(actions, acting)
+        acting, count = EVERY_LANE, self.num_envs
+        if self._clues_open:
+            acting = rules.show_clue(s, self._lane_clue)  # (N,) bool
+            count = int(np.count_nonzero(acting))
+            self._clues_open = count < self.num_envs
+        if count:
+            if acting is not EVERY_LANE:
+                action = np.where(acting, action, self._controls.actions - 1)
+            self.move_agents(action)
             s.timer -= acting
             due = s.timer == 0  # only a lane that acts gets there
             if np.count_nonzero(due):
                 self._change_tiles(due.nonzero()[0], rewards, terminated)
-            burn_agents(s, acting, rewards, terminated)
-            s.episode_return += rewards
-        endless = self.variant.endless
-        truncated = (s.length == s.step_limit) & ~terminated if endless else np.zeros(self.num_envs, bool)
-        return rewards, terminated, truncated
-
-    def _acting_lanes(self) -> np.ndarray:
-        """Shows the clues' next step. Which lanes may act: (N,) bool, or EVERY_LANE while no clue is shown."""
-        if not self._clues_open:
-            return EVERY_LANE
-        acting = show_clue(self.state, self._lane_clue)
-        self._clues_open = bool(np.count_nonzero(acting) < self.num_envs)
-        return acting
-
-    def _move(self, actions: np.ndarray, acting: np.ndarray) -> None:
-        """Turns and moves the agents that may act."""
-        s = self.state
-        action = actions if self.variant.grid else actions[:, 0] * 3 + actions[:, 1]  # (N,)
-        if acting is not EVERY_LANE:
-            action = np.where(acting, action, self._controls.actions - 1)
-        s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._agent_tables.walk)
+            rules.burn_agents(s, acting, rewards, terminated)
+        return rewards, terminated
 
     def _change_tiles(self, lanes: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
         """Puts out the lanes' tiles that burn, and lights those that do not, which checks the command."""
         s = self.state
         burning = s.burning[lanes]
         if np.count_nonzero(burning):
-            extinguish_tiles(s, lanes[burning])
+            rules.extinguish_tiles(s, lanes[burning])
             lanes = lanes[~burning]
         if lanes.size:
-            rewards[lanes], sequence_over = ignite_tiles(s, lanes)
+            rewards[lanes], sequence_over = rules.ignite_tiles(s, lanes)
             if self.variant.endless:
                 for lane in lanes[sequence_over].tolist():
-                    self._extend_sequence(lane)
+                    command = below(words(self._rngs[lane]), self.settings[lane]["allowed_commands"])
+                    rules.extend_sequence(s, lane, command)
+                    self._clues_open = True
             else:
                 # Whether or not the last command was carried out, as in the original; a failure overwrites the reward.
                 rewards[lanes] += s.reward_episode[lanes] * sequence_over
                 terminated[lanes] = sequence_over
 
-    def _extend_sequence(self, lane: int) -> None:
-        """Appends a random command to the lane's sequence."""
-        extend_sequence(self.state, lane, below(words(self._rngs[lane]), self.settings[lane]["allowed_commands"]))
-        self._clues_open = True
-
-    def pixels(self, lanes: np.ndarray | slice) -> Any:
+    def pixels(self, lanes: Lanes) -> Any:
         """Fresh observations of the lanes with pixels, of the act task alone as a Dict."""
         if self.variant.clue:
             return self.frames(lanes)
         vector = self.state.vector[lanes]
         return {"visual_observation": self.frames(lanes), "vector_observation": vector.copy()}
 
-    def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
+    def vectors(self, lanes: Lanes) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32."""
-        return make_vectors(self.state, self._vector_tables, lanes)
+        return vectors.make_vectors(self.state, self._vector_tables, lanes)
 
-    def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
+    def frames(self, lanes: Lanes) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3) uint8."""
-        return draw(self.state, self._agent_tables.sheet, lanes)
+        return drawing.draw(self.state, self._agent_tables.sheet, lanes)
 
     def ground_truth(self) -> np.ndarray:
         """A fresh (N, 2): the target's column and row, divided by arena size - 1."""
@@ -270,33 +207,29 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
         """The lanes' ended episodes in numbers, each (n,)."""
-        s = self.state
-        numbers = {"reward": s.episode_return[lanes], "length": s.length[lanes]}
+        s, numbers = self.state, super().summary(lanes)
         if self.variant.endless:
             return numbers | {"commands_completed": s.completed[lanes], "max_command_sequence": s.count[lanes] - 1}
         success = s.current[lanes] >= s.count[lanes]
-        failed = s.burning[lanes] & ~on_target(s, lanes) & ~success
+        failed = s.burning[lanes] & ~rules.on_target(s, lanes) & ~success
         share = (s.current[lanes] - failed) / s.count[lanes]
         numbers |= {"success": success.astype(np.int64), "commands_completed": share}
         carried_out = s.completed[lanes] / s.count[lanes]
         return numbers | {"carried_out": carried_out, "is_success": carried_out == 1}
 
     def oracle(self) -> dict[str, np.ndarray]:
-        """The whole task in plain numbers, fresh arrays (N, ...). Besides `seed` and `length`:
+        """The whole task in plain numbers, fresh arrays (N, ...). Besides `seed`, `length` and `position`:
 
-        `position` (N, 2), the agent's centre in pixels, x and y; `tile` and `target_tile` (N, 2), column and row of its
-        tile and of the one that the command leads to; `command` (N,), its index in COMMANDS; `commands` (N, C), the
-        sequence, -1 after its end; `commands_left` (N,), in this round, with the present one; `carried_out` (N,), in
-        this episode.
+        `tile` and `target_tile` (N, 2), column and row of the agent's tile and of the one that the command leads to;
+        `command` (N,), its index in COMMANDS; `commands` (N, C), the sequence, -1 after its end; `commands_left` (N,),
+        in this round, with the present one; `carried_out` (N,), in this episode.
         """
-        s = self.state
-        position, side = s.pos - PAD, s.size[:, None]
-        target = np.rint(s.truth * (side - 1)).astype(np.int64)
-        present = s.commands[np.arange(self.num_envs), np.minimum(s.current, s.count - 1)]
-        numbers = {"position": position, "tile": (position - first_pixel(side)) // TILE, "target_tile": target}
-        counts = {"commands_left": s.count - s.current, "carried_out": s.completed.copy()}
-        commands = np.where(np.arange(s.commands.shape[1]) < s.count[:, None], s.commands, -1)
-        return super().oracle() | numbers | {"command": present, "commands": commands} | counts
+        s, numbers, side = self.state, super().oracle(), self.state.size[:, None]
+        numbers["tile"] = (numbers["position"] - first_pixel(side)) // TILE
+        numbers["target_tile"] = np.rint(s.truth * (side - 1)).astype(np.int64)
+        numbers["command"] = s.commands[np.arange(self.num_envs), np.minimum(s.current, s.count - 1)]
+        numbers["commands"] = np.where(np.arange(s.commands.shape[1]) < s.count[:, None], s.commands, -1)
+        return numbers | {"commands_left": s.count - s.current, "carried_out": s.completed.copy()}
 
     def longest_episode(self, lane: int) -> int:
         """The steps after which the lane's episode is over at the latest, under its reset options; -1: no limit."""
@@ -309,4 +242,4 @@ class MortarMayhem(MemoryGymVectorEnv):
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Circles the lane's target tile in its magnified frame, in place."""
-        circle_target(frame, self.state, lane)
+        drawing.circle_target(frame, self.state, lane)

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from memory_gym_envs.appearance import LARGEST_RADIUS, agent_entries
+from memory_gym_envs.appearance import agent_entries
+from memory_gym_envs.character import LARGEST_RADIUS
 from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.entries import Entries
 from memory_gym_envs.mortar_mayhem.arena import ARENA_SIZES, COMMANDS
@@ -30,6 +31,7 @@ def option_rows(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
     delay, duration = ((6,), (2,)) if grid else ((18,), (6,))
     smallest, largest = ARENA_SIZES[0], ARENA_SIZES[-1]
     most = 100 if clue else VECTOR_COMMANDS
+    last_command = "reward added with the last command's"
     new_command = "reward added when the newest command, a sequence's last, is carried out"
     rows = [
         (endless, max_steps(-1)),
@@ -46,10 +48,7 @@ def option_rows(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
         (True, Option("visual_feedback", True, "bool", None, None, "show burning tiles in red")),
         (True, Option("reward_command_failure", 0.0, "float", None, None, "reward for standing on a burning tile")),
         (True, Option("reward_command_success", 0.1, "float", None, None, "reward for each command carried out")),
-        (
-            not endless,
-            Option("reward_episode_success", 0.0, "float", None, None, "reward added with the last command's"),
-        ),
+        (not endless, Option("reward_episode_success", 0.0, "float", None, None, last_command)),
         (endless, Option("reward_new_command_success", 0.0, "float", None, None, new_command)),
     ]
     return present(rows)

@@ -8,7 +8,7 @@ import numpy as np
 from memory_gym_envs.base import ALL
 from memory_gym_envs.mortar_mayhem.arena import TILE, tile_tables
 from memory_gym_envs.mortar_mayhem.state import BLANK, State
-from memory_gym_envs.state import make_room
+from memory_gym_envs.state import Lanes, make_room
 
 
 def write_clue(s: State, lane: int, commands: list[int]) -> None:
@@ -34,7 +34,7 @@ def show_clue(s: State, first_step: np.ndarray) -> np.ndarray:
     return s.clue_step == s.clue_end
 
 
-def on_target(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+def on_target(s: State, lanes: Lanes) -> np.ndarray:
     """(n,) bool: whether the agent's centre is on the target tile."""
     # Negative differences are huge as unsigned numbers, so one comparison checks both ends.
     inside = (s.pos[lanes] - s.target_corner[lanes]).view(np.uint64) < TILE  # (n, 2)

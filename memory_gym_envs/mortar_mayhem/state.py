@@ -10,17 +10,15 @@ import numpy as np
 from memory_gym_envs.mortar_mayhem.arena import COMMANDS
 from memory_gym_envs.mortar_mayhem.options import VECTOR_COMMANDS
 from memory_gym_envs.state import array
+from memory_gym_envs.walking import WalkingState
 
 BLANK = 0  # the symbol that is shown between commands; a command's symbol is 1 + command
 
 
 @dataclass
-class State:
-    """One array a field, one row a lane. Positions are stored with PAD added. `arena` explains floors and tiles."""
+class State(WalkingState):
+    """The lanes' state. `arena` explains floors and tiles."""
 
-    pos: np.ndarray = array("N", 2)  # the agent's centre, x and y
-    facing: np.ndarray = array("N")
-    figure: np.ndarray = array("N")  # which of the batch's figures the agent is
     size: np.ndarray = array("N")  # tiles along one side of the arena
     calm_floor: np.ndarray = array("N")  # the floor that is shown while nothing burns
     floor: np.ndarray = array("N")  # the floor that is shown
@@ -41,14 +39,11 @@ class State:
     explosion_duration: np.ndarray = array("N")
     show_duration: np.ndarray = array("N")
     show_delay: np.ndarray = array("N")
-    length: np.ndarray = array("N")  # steps so far
-    episode_return: np.ndarray = array("N", dtype=np.float64)  # sum of rewards so far
     # The command vector: a one-hot row for each command, flattened.
     vector: np.ndarray = array("N", VECTOR_COMMANDS * len(COMMANDS), dtype=np.float32)
     # Options that the rules need at every step.
-    visual_feedback: np.ndarray = array("N", dtype=bool)
-    step_limit: np.ndarray = array("N")  # steps until truncation
-    reward_success: np.ndarray = array("N", dtype=np.float64)
-    reward_failure: np.ndarray = array("N", dtype=np.float64)
-    reward_episode: np.ndarray = array("N", dtype=np.float64)
-    reward_new_command: np.ndarray = array("N", dtype=np.float64)
+    visual_feedback: np.ndarray = array("N", dtype=bool, option="visual_feedback")
+    reward_success: np.ndarray = array("N", dtype=np.float64, option="reward_command_success")
+    reward_failure: np.ndarray = array("N", dtype=np.float64, option="reward_command_failure")
+    reward_episode: np.ndarray = array("N", dtype=np.float64, option="reward_episode_success")
+    reward_new_command: np.ndarray = array("N", dtype=np.float64, option="reward_new_command_success")

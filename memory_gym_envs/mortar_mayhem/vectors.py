@@ -4,50 +4,27 @@ Shape letters: F floors, N lanes, n some of them, V entries of a vector observat
 """
 
 from functools import cache, lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
-from memory_gym_envs.appearance import (
-    CORNERS,
-    AppearanceTables,
-    View,
-    covered,
-    make_appearance_tables,
-    write_agent_entries,
-)
+from memory_gym_envs.appearance import CORNERS, AppearanceTables, VectorTables, View, tables_of, vector_tables
 from memory_gym_envs.character import FACINGS, PAD, Figure, sprites
 from memory_gym_envs.drawing import SCREEN, read_only
-from memory_gym_envs.entries import vector_slices
 from memory_gym_envs.mortar_mayhem.arena import ARENA_SIZES, COMMANDS, FLOORS, TILE, first_pixel, tile_tables
 from memory_gym_envs.mortar_mayhem.drawing import SYMBOL, SYMBOL_AT, symbols
 from memory_gym_envs.mortar_mayhem.options import MortarVariant
 from memory_gym_envs.mortar_mayhem.state import State
+from memory_gym_envs.state import Lanes
 
 # (10, 9) a command as one-hot, for every symbol; BLANK: zeros
 COMMAND_ENTRIES = read_only(np.eye(1 + len(COMMANDS), dtype=np.float32)[:, 1:])
 
 
-class VectorTables(NamedTuple):
-    """What `make_vectors` looks up."""
-
-    slices: dict[str, slice]  # where the entries are in a vector
-    width: int  # V
-    appearance: AppearanceTables
-    lane_sprite: np.ndarray  # (N,) the first sprite of the lane's figure in them
-    large: bool  # whether any agent is large enough to hide a tile
-
-
 def make_vector_tables(variant: MortarVariant, figures: tuple[Figure, ...], figure: np.ndarray) -> VectorTables:
     """The tables for lanes whose agents are figures[figure], figure (N,)."""
     views = len(symbols()) if variant.clue else 1  # of each figure
-    return VectorTables(
-        vector_slices(variant.entries),
-        sum(row.width for row in variant.entries),
-        appearance_tables(figures, variant.clue),
-        figure * (views * FACINGS),
-        any(2 * each.reach > TILE for each in figures),  # one that is no wider than a tile cannot hide one
-    )
+    appearance, scales = appearance_tables(figures, variant.clue), [each.scale for each in figures]
+    return vector_tables(variant.entries, appearance, figure * (views * FACINGS), scales, TILE)
 
 
 @lru_cache(maxsize=16)
@@ -60,7 +37,7 @@ def appearance_tables(figures: tuple[Figure, ...], clue: bool) -> AppearanceTabl
         reach = range(PAD - around, PAD + SCREEN + around + 1)
         image, solid = sprites(figure.scale)
         views += [View(figure.scale, image, solid, each, reach, reach) for each in free]
-    return make_appearance_tables(views)
+    return tables_of(views)
 
 
 @cache
@@ -80,9 +57,9 @@ def floor_entries() -> np.ndarray:
     return read_only(np.column_stack([size, fire, safe]).astype(np.float32))
 
 
-def make_vectors(s: State, tables: VectorTables, lanes: np.ndarray | slice) -> np.ndarray:
+def make_vectors(s: State, tables: VectorTables, lanes: Lanes) -> np.ndarray:
     """Fresh vector observations of the lanes, (n, V) float32."""
-    at = tables.slices
+    at = tables.at
     sprite = tables.lane_sprite[lanes] + s.facing[lanes]  # (n,)
     out = np.empty((len(sprite), tables.width), np.float32)
     if "command" in at:
@@ -91,7 +68,7 @@ def make_vectors(s: State, tables: VectorTables, lanes: np.ndarray | slice) -> n
         out[:, at["command"]] = COMMAND_ENTRIES.take(symbol, axis=0)
     else:
         out[:, at["commands"]] = s.vector[lanes]
-    write_agent_entries(out[:, at["size"].start : at["facing"].stop], tables.appearance, sprite, s.pos[lanes])
+    tables.write_agents(out, sprite, s.pos[lanes])
     floor = out[:, at["arena"].start : at["safe"].stop]  # (n, 4)
     floor[:] = floor_entries().take(s.floor[lanes], axis=0)
     if tables.large:
@@ -99,9 +76,7 @@ def make_vectors(s: State, tables: VectorTables, lanes: np.ndarray | slice) -> n
     return out
 
 
-def hide_floor(
-    out: np.ndarray, s: State, lanes: np.ndarray | slice, sprite: np.ndarray, tables: AppearanceTables
-) -> None:
+def hide_floor(out: np.ndarray, s: State, lanes: Lanes, sprite: np.ndarray, tables: AppearanceTables) -> None:
     """Clears the floor's entries (n, 4) of what large agents hide, in place.
 
     It checks eight pixels alone: the corners of the arena and of the target tile. The arena shows if one of its corners
@@ -113,7 +88,7 @@ def hide_floor(
     tile = s.target_corner[lanes][:, None] + CORNERS * (TILE - 1)  # (n, 4, 2)
     points = np.concatenate([arena, tile], axis=1)  # (n, 8, 2)
     x, y = np.moveaxis(points - PAD, -1, 0)
-    shown = ~covered(tables, sprite, s.pos[lanes], points) & ~symbol_masks()[s.symbol[lanes][:, None], y, x]  # (n, 8)
+    shown = ~tables.covered(sprite, s.pos[lanes], points) & ~symbol_masks()[s.symbol[lanes][:, None], y, x]  # (n, 8)
     shows_fire = shown[:, :4] & (arena != tile).any(axis=-1)
     out[:, 0] *= shown[:, :4].any(axis=1)
     out[:, 1:] *= shows_fire.any(axis=1)[:, None]

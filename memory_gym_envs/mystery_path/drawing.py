@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from memory_gym_envs.character import FACINGS, PAD, SPAN, radius_of
+from memory_gym_envs.character import FACINGS, PAD, PIXELS, SPAN, radius_of
 from memory_gym_envs.drawing import (
     BLUE,
     FRAME,
@@ -23,9 +23,11 @@ from memory_gym_envs.drawing import (
     paste,
     read_only,
     stamp,
+    tile_picture,
 )
 from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE
-from memory_gym_envs.mystery_path.state import NO_CELL, ROWS, State, tiles_of
+from memory_gym_envs.mystery_path.state import FAST, NO_CELL, ROWS, State, tiles_of
+from memory_gym_envs.state import Lanes
 
 GREY, ICE = (210, 210, 210), (125, 177, 250)
 CROSS = 10  # width of the cross
@@ -42,19 +44,11 @@ TRAIL_KIND[[2 - TILE, SCREEN - 2]] = EDGE
 
 
 @cache
-def tile_picture(inner: tuple[int, int, int], border: tuple[int, int, int]) -> np.ndarray:
-    """A tile with a border of one pixel, (TILE, TILE, 3) uint8."""
-    picture = np.tile(np.array(border, np.uint8), (TILE, TILE, 1))
-    picture[1:-1, 1:-1] = inner
-    return read_only(picture)
-
-
-@cache
 def tiles() -> Sheet:
     """Every kind of tile, to be pasted where a part of it may be off the screen."""
     colors = [(WHITE, GREY), (BLUE, BLUE), (GREEN, GREEN), (RED, RED), (GREY, GREY)]
-    pictures = np.stack([tile_picture(*color) for color in colors])
-    return make_sheet(pictures, np.ones(pictures.shape[:3], bool), np.arange(SPAN) - PAD)
+    pictures = np.stack([tile_picture(TILE, *color) for color in colors])
+    return make_sheet(pictures, np.ones(pictures.shape[:3], bool), PIXELS)
 
 
 def cross_mask() -> np.ndarray:
@@ -66,14 +60,14 @@ def cross_mask() -> np.ndarray:
 @cache
 def crosses() -> Sheet:
     """The red cross."""
-    picture = np.tile(np.array(RED, np.uint8), (CROSS, CROSS, 1))
-    return make_sheet(picture[None], cross_mask()[None], np.arange(SPAN) - PAD)
+    picture = np.full((CROSS, CROSS, 3), RED, np.uint8)
+    return make_sheet(picture[None], cross_mask()[None], PIXELS)
 
 
 @cache
 def grounds() -> np.ndarray:
     """Black, then the tiled background moved left by 0, 1, 2, ... pixels: (1 + TILE, FRAME) uint8."""
-    ice = np.tile(tile_picture(ICE, GREY), (SIDE, SIDE + 1, 1))
+    ice = np.tile(tile_picture(TILE, ICE, GREY), (SIDE, SIDE + 1, 1))
     pictures = [np.zeros((SCREEN, SCREEN, 3), np.uint8), *(ice[:, shift : shift + SCREEN] for shift in range(TILE))]
     return read_only(np.stack(pictures).reshape(-1, FRAME))
 
@@ -97,7 +91,20 @@ def camera_columns(values: dict[str, Any]) -> tuple[int, int]:
     return corner + int(radius - corner + camera) + PAD, math.floor(radius + camera + 0.5) + PAD
 
 
-def place_on_screen(s: State, lanes: np.ndarray | slice, endless: bool) -> np.ndarray:
+def place_camera(s: State, lanes: np.ndarray, values: dict[str, Any]) -> None:
+    """Writes what the endless id's options mean for the camera, and for what moves with it, to these lanes."""
+    speed = int(values["agent_speed"])
+    s.extras[lanes] |= values["agent_speed"] > FAST
+    s.speed[lanes] = speed
+    s.ground_period[lanes] = speed * math.ceil(TILE / speed) if speed else 1
+    s.camera[lanes] = TILE * values["camera_offset_scale"]
+    s.trail_columns[lanes] = int(values["camera_offset_scale"])
+    figure_x, cross_x = camera_columns(values)
+    s.figure_x[lanes], s.cross_x[lanes] = figure_x, cross_x
+    s.cross_fits[lanes] = cross_x < PAD + SCREEN - STAMINA_BAR * values["show_stamina"] + CROSS // 2
+
+
+def place_on_screen(s: State, lanes: Lanes, endless: bool) -> np.ndarray:
     """(n, 2) stored positions where the agents are drawn."""
     pos = s.pos[lanes]
     if endless:
@@ -113,7 +120,7 @@ def tile_centres(cell: np.ndarray) -> np.ndarray:
     return tiles_of(cell) * TILE + TILE // 2 + PAD
 
 
-def trail_on_screen(s: State, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def trail_on_screen(s: State, lanes: Lanes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The tiles of the lanes' trails: for each, (t,), the index of its lane in `lanes`, its first pixel, x and y."""
     lane, y = s.trail_lane, s.trail_y  # (T,)
     # Where the camera is between two pixels, the fraction is cut off, towards zero.
@@ -127,14 +134,14 @@ def trail_on_screen(s: State, lanes: np.ndarray | slice) -> tuple[np.ndarray, np
     return owner[mine], x[mine], y[mine]
 
 
-def ground_rows(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+def ground_rows(s: State, lanes: Lanes) -> np.ndarray:
     """(n,) the rows of grounds() that are behind everything."""
     # The background starts again as soon as it has moved by a tile or more. It jumps if the speed does not divide TILE.
     walked = s.pos[lanes, 0] - s.origin[lanes, 0]
     return (walked % s.ground_period[lanes] + 1) * s.show_ground[lanes]
 
 
-def spent_stamina(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+def spent_stamina(s: State, lanes: Lanes) -> np.ndarray:
     """(n,) how many pixels of the bar are red."""
     return (SCREEN * (1 - s.stamina[lanes] / s.stamina_level[lanes])).astype(np.int64)
 
@@ -142,14 +149,14 @@ def spent_stamina(s: State, lanes: np.ndarray | slice) -> np.ndarray:
 # ---- frames ----
 
 
-def draw(s: State, sheet: Sheet, lanes: np.ndarray | slice, endless: bool) -> np.ndarray:
+def draw(s: State, sheet: Sheet, lanes: Lanes, endless: bool) -> np.ndarray:
     """Fresh frames of the lanes, (n, 84, 84, 3) uint8, from the state alone. sheet: of the agents."""
     frames = draw_endless_ground(s, lanes) if endless else draw_ground(s, lanes)  # (n, FRAME)
     draw_agent(frames, s, sheet, lanes, endless)
     return frames.reshape(-1, SCREEN, SCREEN, 3)
 
 
-def draw_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+def draw_ground(s: State, lanes: Lanes) -> np.ndarray:
     """(n, FRAME): black, with the path's origin and goal where they are shown."""
     frames = np.zeros((len(s.last_path_step[lanes]), FRAME), np.uint8)
     if not np.count_nonzero(s.extras[lanes]):
@@ -163,7 +170,7 @@ def draw_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     return frames
 
 
-def draw_endless_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+def draw_endless_ground(s: State, lanes: Lanes) -> np.ndarray:
     """(n, FRAME): black or the background, and the trail where it is shown."""
     if np.count_nonzero(s.extras[lanes]):
         frames = grounds().take(ground_rows(s, lanes), axis=0)
@@ -174,7 +181,7 @@ def draw_endless_ground(s: State, lanes: np.ndarray | slice) -> np.ndarray:
     return frames
 
 
-def draw_trail(frames: np.ndarray, s: State, lanes: np.ndarray | slice) -> None:
+def draw_trail(frames: np.ndarray, s: State, lanes: Lanes) -> None:
     """Draws the trails on the lanes' frames (n, FRAME), in place."""
     owner, x, y = trail_on_screen(s, lanes)
     whole = (x >= 0) & (x <= SCREEN - TILE)
@@ -184,10 +191,10 @@ def draw_trail(frames: np.ndarray, s: State, lanes: np.ndarray | slice) -> None:
         # Cut tiles are drawn first, because the squares that they are pasted in may overlap whole tiles.
         paste(frames, tiles(), TRAIL_KIND.take(x[cut]), centres, owner[cut])
         owner, x, y = owner[whole], x[whole], y[whole]
-    stamp(frames, tile_picture(WHITE, GREY), owner, x, y)
+    stamp(frames, tile_picture(TILE, WHITE, GREY), owner, x, y)
 
 
-def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: np.ndarray | slice, endless: bool) -> None:
+def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: Lanes, endless: bool) -> None:
     """Draws the agents, their stamina and their crosses on the frames (n, FRAME), in place."""
     pos, extras = place_on_screen(s, lanes, endless), endless and np.count_nonzero(s.extras[lanes])
     paste(frames, sheet, s.figure[lanes] * FACINGS + s.facing[lanes], pos)

@@ -1,54 +1,24 @@
 """The Mystery Path environments."""
 
-import math
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import DEBUG_ZOOM, MemoryGymVectorEnv, limit_of, numbered
-from memory_gym_envs.character import (
-    PAD,
-    SPAN,
-    STRIDES,
-    Figure,
-    agent_tables,
-    free_controls,
-    grid_controls,
-    radius_of,
-    walk,
-)
+from memory_gym_envs.appearance import VectorTables
+from memory_gym_envs.base import DEBUG_ZOOM
+from memory_gym_envs.character import PAD, Figure, radius_of
 from memory_gym_envs.drawing import SCREEN, magnify
-from memory_gym_envs.mystery_path.drawing import CROSS, STAMINA_BAR, camera_columns, draw, draw_truth
-from memory_gym_envs.mystery_path.levels import FIRST_SEGMENTS, append_segment, sample_level, write_level
-from memory_gym_envs.mystery_path.options import SEGMENT, SHOWN, SIDE, TILE, VARIANTS
-from memory_gym_envs.mystery_path.rules import (
-    BRANCHES,
-    TILE_AT,
-    enter_tiles,
-    forget_trails,
-    put_back,
-    spend_stamina,
-    walk_endless,
-)
-from memory_gym_envs.mystery_path.state import (
-    FAST,
-    MAP_STRIDES,
-    NO_CELL,
-    PIT,
-    PIT_ROWS,
-    ROWS,
-    State,
-    make_path_room,
-    tiles_of,
-)
-from memory_gym_envs.mystery_path.vectors import ViewOptions, make_vector_tables, make_vectors
-from memory_gym_envs.state import empty
+from memory_gym_envs.mystery_path import drawing, levels, rules, vectors
+from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE, VARIANTS
+from memory_gym_envs.mystery_path.state import MAP_STRIDES, NO_CELL, PIT, PIT_ROWS, ROWS, State, tiles_of
+from memory_gym_envs.state import Lanes, empty
+from memory_gym_envs.walking import WalkingVectorEnv, numbered
 
-GRID_SCALE = 0.25  # the agent's size in the grid id
+TRUTHS = (np.eye(4), np.eye(4, 3))  # one-hot directions: all, and all but west
 
 
-class MysteryPath(MemoryGymVectorEnv):
+class MysteryPath(WalkingVectorEnv):
     """Mystery Path (thesis 4.4): follow an invisible path by remembering where the agent fell off.
 
     ## Description
@@ -63,36 +33,16 @@ class MysteryPath(MemoryGymVectorEnv):
 
     ## Action Space
 
-    `MultiDiscrete([3, 3])`:
-
-    | value | horizontal | vertical |
-    |---|---|---|
-    | 0 | none | none |
-    | 1 | left | up |
-    | 2 | right | down |
-
-    `Discrete(4)`, Grid id:
-
-    | value | action |
-    |---|---|
-    | 0 | nothing |
-    | 1 | turn left |
-    | 2 | turn right |
-    | 3 | one tile forward |
-
-    `Discrete(4)`, endless id:
-
-    | value | action |
-    |---|---|
-    | 0 | nothing |
-    | 1 | right |
-    | 2 | up |
-    | 3 | down |
+    | space | 0 | 1 | 2 | 3 |
+    |---|---|---|---|---|
+    | `MultiDiscrete([3, 3])`, horizontal | none | left | right | |
+    | and vertical | none | up | down | |
+    | `Discrete(4)`, Grid id | nothing | turn left | turn right | one tile forward |
+    | `Discrete(4)`, endless id | nothing | right | up | down |
 
     ## Observation Space
 
-    With obs_type="pixels" `Box(0, 255, (84, 84, 3), uint8)`, rows first; with "grayscale" the same with one channel,
-    (84, 84, 1); with "vector" a flat float32 vector, which `docs/vectors.md` and `VARIANTS[id].entries` describe.
+    `Box(0, 255, (84, 84, 3), uint8)`, rows first. Other values of `obs_type` change that: see Arguments.
 
     ## Rewards
 
@@ -134,122 +84,79 @@ class MysteryPath(MemoryGymVectorEnv):
     """
 
     variants = VARIANTS
-    tables = ("_agent_tables", "_vector_tables")
+    tile = TILE
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
         """The observation space of one lane with pixels, and its action space."""
-        free = not (self.variant.grid or self.variant.endless)
-        actions = gym.spaces.MultiDiscrete([3, 3]) if free else gym.spaces.Discrete(4)
-        return gym.spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8), actions
+        image, actions = super().spaces()
+        return image, gym.spaces.Discrete(4) if self.variant.endless else actions
 
     def allocate(self) -> None:
         """Makes the state of N lanes."""
-        segments = FIRST_SEGMENTS + 1 if self.variant.endless else 1
+        segments = levels.FIRST_SEGMENTS + 1 if self.variant.endless else 1
         self.state = empty(State, N=self.num_envs, P=SIDE * SIDE + 1, M=segments * SEGMENT * ROWS, T=0)
         self.state.path_cell[:, PIT] = NO_CELL
-        self.figures = (self._figure(self.defaults),)  # the different ones of all lanes
-        self.view_options = (self._view_options(self.defaults),)  # likewise
-        self.place_tables()
 
     def configure(self, lanes: np.ndarray) -> None:
-        """Takes over the options of the lanes, and the tables that all lanes' options need."""
+        """Takes over the agent's size, and in the endless id what the camera and what moves with it depend on."""
         s, values = self.state, self.settings[int(lanes[0])]
-        s.step_limit[lanes] = limit_of(values["max_steps"])
-        s.visual_feedback[lanes] = values["visual_feedback"]
-        s.radius[lanes] = radius_of(self._scale(values))
-        for what, option in SHOWN.items():
-            getattr(s, f"show_{what}")[lanes] = values.get(option, False)
-        shown = any(values.get(option, False) for what, option in SHOWN.items() if what != "past")
-        s.extras[lanes] = shown or values.get("agent_speed", 0.0) > FAST
-        s.reward_goal[lanes] = values.get("reward_goal", 0.0)
-        s.reward_fall_off[lanes] = values["reward_fall_off"]
-        s.reward_progress[lanes] = values["reward_path_progress"]
-        s.reward_dense[lanes] = values.get("reward_path_progress_dense", 0.0)
-        s.reward_step[lanes] = values["reward_step"]
-        s.stamina_level[lanes] = values.get("stamina_level", 1)
-        s.origin_restores[lanes] = values.get("origin_restores_stamina", False)
+        s.radius[lanes] = radius_of(self.scale_of(values))
+        s.extras[lanes] = (s.show_origin | s.show_goal | s.show_ground | s.show_stamina)[lanes]
         if self.variant.endless:
-            self._place_camera(lanes, values)
-        self.figures, s.figure[:] = numbered([self._figure(each) for each in self.settings])
-        self.view_options, s.view[:] = numbered([self._view_options(each) for each in self.settings])
-        self.place_tables()
+            drawing.place_camera(s, lanes, values)
 
-    def _place_camera(self, lanes: np.ndarray, values: dict[str, Any]) -> None:
-        """Takes over the endless id's options that the camera and what moves with it depend on."""
-        s, speed = self.state, int(values["agent_speed"])
-        s.camera[lanes] = TILE * values["camera_offset_scale"]
-        s.trail_columns[lanes] = int(values["camera_offset_scale"])
-        s.speed[lanes] = speed
-        s.ground_period[lanes] = speed * math.ceil(TILE / speed) if speed else 1
-        figure_x, cross_x = camera_columns(values)
-        s.figure_x[lanes], s.cross_x[lanes] = figure_x, cross_x
-        s.cross_fits[lanes] = cross_x < PAD + SCREEN - STAMINA_BAR * values["show_stamina"] + CROSS // 2
-
-    def _scale(self, values: dict[str, Any]) -> float:
-        return GRID_SCALE if self.variant.grid else values["agent_scale"]
-
-    def _figure(self, values: dict[str, Any]) -> Figure:
-        scale = self._scale(values)
-        if self.variant.grid:
-            return Figure(scale, TILE, 0, SCREEN, TILE // 2, False)
-        return Figure(scale, values["agent_speed"], 0, SCREEN, radius_of(scale), False)
-
-    def _view_options(self, values: dict[str, Any]) -> ViewOptions:
-        scale = self._scale(values)
-        if not self.variant.endless:
-            return ViewOptions(scale, None, 0, SCREEN)
-        figure_x, cross_x = camera_columns(values)
-        return ViewOptions(scale, figure_x, cross_x - figure_x, SCREEN - STAMINA_BAR * values["show_stamina"])
+    def figures_of(self, values: dict[str, Any]) -> tuple[Figure, ...]:
+        """The agent's figure under these options."""
+        return (self.figure_of(values, 0, SCREEN),)
 
     def place_tables(self) -> None:
         """Looks up the tables that follow from the options, and where each lane's rows start in them."""
-        self._agent_tables = agent_tables(self.figures)
-        self._controls = grid_controls() if self.variant.grid else free_controls()
-        self._truths = np.eye(4)[:, : 3 if self.variant.endless else 4].copy()
-        self._lane_walk = self.state.figure[:, None] * (STRIDES * SPAN)  # (N, 1)
+        endless = self.variant.endless
+        every = [vectors.view_options_of(values, self.scale_of(values), endless) for values in self.settings]
+        self.view_options, self.state.view[:] = numbered(every)
+        super().place_tables()
+        self._place_lanes()
+
+    def _place_lanes(self) -> None:
+        """Finds where each lane's cells and steps start in the flattened state."""
         self._lane_map = np.arange(self.num_envs) * self.state.step_at.shape[1] + PIT_ROWS  # (N,)
         self._lane_path = np.arange(self.num_envs) * self.state.path_cell.shape[1]  # (N,)
-        if self.obs_type == "vector":
-            self._vector_tables = make_vector_tables(self.variant.entries, self.view_options)
+
+    def vector_tables(self) -> VectorTables:
+        """The tables of vector observations."""
+        return vectors.make_vector_tables(self.variant, self.view_options, self.state.view)
 
     def begin(self, lanes: np.ndarray) -> None:
         """Samples the lanes' next levels and starts their episodes."""
-        forget_trails(self.state, lanes)
+        rules.forget_trails(self.state, lanes)
         for lane in lanes.tolist():
-            level = sample_level(self._rngs[lane], self.settings[lane], self.variant)
-            if make_path_room(self.state, len(level.path), len(level.walls)):
-                self.place_tables()
-            write_level(self.state, lane, level, self.variant.endless)
+            level = levels.sample_level(self._rngs[lane], self.settings[lane], self.variant)
+            if levels.write_level(self.state, lane, level, self.variant.endless):
+                self._place_lanes()
 
-    def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """One step of the rules: walk, enter a tile or fall off, end. Returns rewards, terminated, truncated, (N,)."""
+    def apply_rules(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Walks, and enters a tile or falls off: rewards and terminations, (N,) each."""
         s, endless = self.state, self.variant.endless
-        s.length += 1
-        action = actions if actions.ndim == 1 else actions.dot(BRANCHES)  # (N,)
         if np.count_nonzero(s.fallen):
-            action = put_back(s, action)
+            action = rules.put_back(s, action)
         if endless:
-            walk_endless(s, action)
+            rules.walk_endless(s, action)
             s.tile = (s.pos - PAD) // TILE  # (N, 2)
             self._extend_paths()
         else:
-            s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._agent_tables.walk)
-            s.tile = TILE_AT.take(s.pos)  # (N, 2)
+            self.move_agents(action)
+            s.tile = rules.TILE_AT.take(s.pos)  # (N, 2)
         cell = s.tile.dot(MAP_STRIDES) + self._lane_map  # (N,)
         before, s.path_step = s.path_step, s.step_at.take(cell)
         s.fallen = s.path_step == PIT
         rewards = s.reward_step.copy()
         landed = int(np.count_nonzero(s.path_step != before))
         if landed:
-            enter_tiles(s, self._lane_path, rewards, endless)
-        terminated = spend_stamina(s, cell, landed) if endless else s.path_step == s.path_length
+            rules.enter_tiles(s, self._lane_path, rewards, endless)
+        terminated = rules.spend_stamina(s, cell, landed) if endless else s.path_step == s.path_length
         if not endless and np.count_nonzero(terminated):
             rewards += terminated * s.reward_goal
-        s.episode_return += rewards
-        truncated = s.length == s.step_limit
-        if np.count_nonzero(truncated):
-            truncated &= ~terminated
-        return rewards, terminated, truncated
+        return rewards, terminated
 
     def _extend_paths(self) -> None:
         """Appends a segment to the paths whose last segment the agent just entered."""
@@ -258,25 +165,24 @@ class MysteryPath(MemoryGymVectorEnv):
         if not np.count_nonzero(entered):
             return
         for lane in np.flatnonzero(entered).tolist():
-            if append_segment(s, lane, self._rngs[lane]):
-                self.place_tables()
+            if levels.append_segment(s, lane, self._rngs[lane]):
+                self._place_lanes()
 
-    def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
+    def vectors(self, lanes: Lanes) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32."""
-        return make_vectors(self.state, self._vector_tables, lanes, self.variant.endless)
+        return vectors.make_vectors(self.state, self._vector_tables, lanes, self.variant.endless)
 
-    def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
+    def frames(self, lanes: Lanes) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3) uint8."""
-        return draw(self.state, self._agent_tables.sheet, lanes, self.variant.endless)
+        return drawing.draw(self.state, self._agent_tables.sheet, lanes, self.variant.endless)
 
     def ground_truth(self) -> np.ndarray:
         """The direction of the path's next tile: a fresh one-hot (N, 4), endless (N, 3)."""
-        return self._truths.take(self.state.next_direction, axis=0)
+        return TRUTHS[self.variant.endless].take(self.state.next_direction, axis=0)
 
     def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
         """The lanes' ended episodes in numbers, each (n,)."""
-        s = self.state
-        numbers = {"reward": s.episode_return[lanes], "length": s.length[lanes]}
+        s, numbers = self.state, super().summary(lanes)
         if self.variant.endless:
             places = {"max_x": s.max_column[lanes], "tiles_visited": s.visited[lanes]}
             return numbers | {"num_fails": s.fails[lanes]} | places
@@ -284,25 +190,25 @@ class MysteryPath(MemoryGymVectorEnv):
         return numbers | {"success": success.astype(np.int64), "num_fails": s.fails[lanes], "is_success": success}
 
     def oracle(self) -> dict[str, np.ndarray]:
-        """The whole task in plain numbers, fresh arrays (N, ...). Besides `seed` and `length`:
+        """The whole task in plain numbers, fresh arrays (N, ...). Besides `seed`, `length` and `position`:
 
-        `position` (N, 2), the agent's centre in pixels, x and y; `tile` (N, 2), its column and row; `next_tile` (N, 2),
-        the path's next one from where the agent last was on it; `path` (N, P, 2), its tiles so far, -1 after the last;
-        `falls` (N,); in the finite ids `goal_tile` (N, 2) and `tiles_left` (N,), how many follow on the path. In the
-        endless id, columns and x are counted along the path.
+        `tile` (N, 2), the agent's column and row; `next_tile` (N, 2), the path's next one from where the agent last was
+        on it; `path` (N, P, 2), its tiles so far, -1 after the last; `falls` (N,); in the finite ids `goal_tile` (N, 2)
+        and `tiles_left` (N,), how many follow on the path. In the endless id, columns and x are counted along the path.
         """
         s, lanes = self.state, np.arange(self.num_envs)
         step = np.maximum(s.last_path_step, 1)
         following = s.path_cell[lanes, np.minimum(step + 1, s.path_length)]
-        numbers = {"position": s.pos - PAD, "tile": s.tile.copy(), "next_tile": tiles_of(following)}
+        numbers = super().oracle() | {"tile": s.tile.copy(), "next_tile": tiles_of(following)}
         over = np.arange(s.path_cell.shape[1] - 1) >= s.path_length[:, None]
         numbers["path"] = np.where(over[..., None], -1, tiles_of(s.path_cell[:, 1:]))
         numbers["falls"] = s.fails.copy()
         if not self.variant.endless:
             numbers["goal_tile"] = tiles_of(s.path_cell[lanes, s.path_length])
             numbers["tiles_left"] = s.path_length - step
-        return super().oracle() | numbers
+        return numbers
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Draws the path in white, its origin and transition tiles blue, its goal green, walls red, then the agent."""
-        frame[:] = magnify(draw_truth(self.state, self._agent_tables.sheet, lane, self.variant.endless), DEBUG_ZOOM)
+        truth = drawing.draw_truth(self.state, self._agent_tables.sheet, lane, self.variant.endless)
+        frame[:] = magnify(truth, DEBUG_ZOOM)

@@ -175,8 +175,9 @@ def cells_of(places: list[int], segment: int) -> list[int]:
     return [CELLS[place] + shift for place in places]
 
 
-def write_level(s: State, lane: int, level: Level, endless: bool) -> None:
-    """Starts the lane's episode at this level, for which there must be room."""
+def write_level(s: State, lane: int, level: Level, endless: bool) -> bool:
+    """Starts the lane's episode at this level. Returns whether the state's arrays had to be widened."""
+    widened = make_path_room(s, len(level.path), len(level.walls))
     s.step_at[lane] = PIT
     s.fell_at[lane] = s.walls[lane] = s.fallen[lane] = s.shows_cross[lane] = False
     s.path_length[lane] = s.segments[lane] = s.max_column[lane] = s.fails[lane] = s.visited[lane] = 0
@@ -196,6 +197,7 @@ def write_level(s: State, lane: int, level: Level, endless: bool) -> None:
     s.path_step[lane], s.last_path_step[lane] = NO_STEP, ORIGIN  # the first step lands on it
     s.next_direction[lane] = s.direction_at[lane, ORIGIN]
     s.stamina[lane] = s.stamina_level[lane]
+    return widened
 
 
 def write_path(s: State, lane: int, level: Level, endless: bool) -> None:

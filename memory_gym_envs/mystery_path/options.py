@@ -1,7 +1,7 @@
 """The ids of Mystery Path: their tiles, reset options and entries of a vector observation."""
 
-from memory_gym_envs.appearance import LARGEST_RADIUS, agent_entries
-from memory_gym_envs.character import PAD, SPAN
+from memory_gym_envs.appearance import agent_entries
+from memory_gym_envs.character import LARGEST_RADIUS, PAD, SPAN
 from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.entries import Entries
 from memory_gym_envs.options import Option
@@ -14,16 +14,8 @@ SEGMENT = SIDE + 1  # columns of a segment and the transition tile behind it
 # Of the finite ids: what AGaLiTe (Pramanik et al., 2023) calls easy.
 EASY = {"show_origin": True, "show_goal": True, "reward_path_progress": 0.1}
 
-SHOWN = {  # by the options that show something: the state has a field show_... for each
-    "origin": "show_origin",
-    "goal": "show_goal",
-    "past": "show_past_path",
-    "ground": "show_background",
-    "stamina": "show_stamina",
-}
 
-
-def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
+def option_rows(grid: bool, endless: bool) -> tuple[Option, ...]:
     """The reset options of an id, in the original's order."""
     steps, progress = -1 if endless else 128 if grid else 512, 0.0 if grid else 0.1
     origin = "show the path's origin in blue"
@@ -54,7 +46,7 @@ def _options(grid: bool, endless: bool) -> tuple[Option, ...]:
     return present(rows)
 
 
-def _entries(endless: bool) -> tuple[Entries, ...]:
+def entry_rows(endless: bool) -> tuple[Entries, ...]:
     """The entries of an id's vector observation."""
     cross = Entries("cross", 1, "1: a red cross is visible, where the agent fell off")
     if not endless:
@@ -67,25 +59,25 @@ def _entries(endless: bool) -> tuple[Entries, ...]:
         "1: a tile of the path behind the agent is visible; by column and then row: 7 rows, and 8 columns of 12 pixels "
         "for the tile's left edge, the first of them left of the screen"
     )
+    scroll = "how far right of its column's left edge each of these tiles starts, at most, / 12 pixels"
     return (
         *agent_entries(-PAD, SPAN - 1 - PAD),
         cross,
         Entries("past", SEGMENT * SIDE, past),
-        Entries(
-            "scroll", 1, "how far right of its column's left edge each of these tiles starts, at most, / 12 pixels"
-        ),
+        Entries("scroll", 1, scroll),
         Entries("ground", 1, "one more than how far left the background has moved, / 12 pixels; 0: no background"),
         Entries("bar", 1, "1: the stamina bar is visible"),
         Entries("stamina", 1, "share of the stamina bar that is green"),
     )
 
 
-def _variant(render_fps: int, grid: bool = False, endless: bool = False) -> Variant:
-    return Variant(render_fps, _options(grid, endless), _entries(endless), grid, endless)
+def make_variant(fps: int, grid: bool = False, endless: bool = False) -> Variant:
+    """The id with these properties."""
+    return Variant(fps, option_rows(grid, endless), entry_rows(endless), grid, endless)
 
 
 VARIANTS = {
-    "MysteryPath-v0": _variant(25),
-    "MysteryPath-Grid-v0": _variant(3, grid=True),
-    "Endless-MysteryPath-v0": _variant(25, endless=True),
+    "MysteryPath-v0": make_variant(25),
+    "MysteryPath-Grid-v0": make_variant(3, grid=True),
+    "Endless-MysteryPath-v0": make_variant(25, endless=True),
 }

@@ -5,12 +5,11 @@ Shape letters: N lanes, n some of them, K steps back along the path, T tiles of 
 
 import numpy as np
 
-from memory_gym_envs.character import FACINGS, PAD, SPAN
+from memory_gym_envs.character import FACINGS, PIXELS
 from memory_gym_envs.mystery_path.options import SIDE, TILE
 from memory_gym_envs.mystery_path.state import NO_STEP, ORIGIN, PIT_ROWS, ROWS, WEST, State
 
-BRANCHES = np.array([3, 1])  # numbers the actions of two branches from 0 to 8
-TILE_AT = (np.arange(SPAN) - PAD) // TILE  # of stored positions on the screen
+TILE_AT = PIXELS // TILE  # of stored positions on the screen
 # The endless id's actions: 0 nothing, 1 right, 2 up, 3 down.
 ENDLESS_MOVES = np.array([(0, 0), (1, 0), (0, -1), (0, 1)])  # (4, 2)
 ENDLESS_TURN = np.array([(facing, 6, 0, 4) for facing in range(FACINGS)])  # (8, 4) the next facing

@@ -11,6 +11,7 @@ import numpy as np
 
 from memory_gym_envs.mystery_path.options import SEGMENT, SIDE
 from memory_gym_envs.state import array, make_room
+from memory_gym_envs.walking import WalkingState
 
 # Rows of pit above and below the screen. Nothing stops the agent there in the endless id; the largest and fastest one
 # gets nine tiles out.
@@ -37,12 +38,9 @@ def tiles_of(cell: np.ndarray) -> np.ndarray:
 
 
 @dataclass
-class State:
-    """The lanes' state. Positions are pixels with PAD added, tiles count from the top left."""
+class State(WalkingState):
+    """The lanes' state. Tiles count from the top left. In the endless id, columns and x are counted along the path."""
 
-    pos: np.ndarray = array("N", 2)  # the agent's centre, x and y; in the endless id x is counted along the path
-    facing: np.ndarray = array("N")
-    figure: np.ndarray = array("N")  # which of the batch's figures the agent has
     view: np.ndarray = array("N")  # which of the batch's view options it has
     origin: np.ndarray = array("N", 2)  # where the agent starts and is put back to
     tile: np.ndarray = array("N", 2)  # the agent's tile, column and row
@@ -69,33 +67,30 @@ class State:
     stamina: np.ndarray = array("N")  # steps left to reach another tile
     fails: np.ndarray = array("N")  # how often the agent fell off
     visited: np.ndarray = array("N")  # tiles reached so far
-    length: np.ndarray = array("N")  # steps so far
-    episode_return: np.ndarray = array("N", dtype=np.float64)  # sum of rewards so far
 
     # What follows from the options.
     radius: np.ndarray = array("N")  # of the agent's body
     speed: np.ndarray = array("N", 1)  # pixels a step, in the endless id
-    show_origin: np.ndarray = array("N", dtype=bool)
-    show_goal: np.ndarray = array("N", dtype=bool)
-    show_past: np.ndarray = array("N", dtype=bool)
-    show_ground: np.ndarray = array("N", dtype=bool)
-    show_stamina: np.ndarray = array("N", dtype=bool)
+    show_origin: np.ndarray = array("N", dtype=bool, option="show_origin")
+    show_goal: np.ndarray = array("N", dtype=bool, option="show_goal")
+    show_past: np.ndarray = array("N", dtype=bool, option="show_past_path")
+    show_ground: np.ndarray = array("N", dtype=bool, option="show_background")
+    show_stamina: np.ndarray = array("N", dtype=bool, option="show_stamina")
     extras: np.ndarray = array("N", dtype=bool)  # one of these except show_past, or a speed above FAST
-    visual_feedback: np.ndarray = array("N", dtype=bool)
+    visual_feedback: np.ndarray = array("N", dtype=bool, option="visual_feedback")
     camera: np.ndarray = array("N", dtype=np.float64)  # first pixel of column 0 while the agent is at the origin
     trail_columns: np.ndarray = array("N")  # whole tiles between the screen's left edge and the agent
     ground_period: np.ndarray = array("N")  # pixels after which the background starts again
     figure_x: np.ndarray = array("N")  # where the endless id draws the agent
     cross_x: np.ndarray = array("N")  # and its cross
     cross_fits: np.ndarray = array("N", dtype=bool)  # some of that cross is left of the stamina bar
-    step_limit: np.ndarray = array("N")  # steps until truncation
-    stamina_level: np.ndarray = array("N")
-    origin_restores: np.ndarray = array("N", dtype=bool)  # stamina
-    reward_goal: np.ndarray = array("N", dtype=np.float64)
-    reward_fall_off: np.ndarray = array("N", dtype=np.float64)
-    reward_progress: np.ndarray = array("N", dtype=np.float64)
-    reward_dense: np.ndarray = array("N", dtype=np.float64)
-    reward_step: np.ndarray = array("N", dtype=np.float64)
+    stamina_level: np.ndarray = array("N", option="stamina_level")
+    origin_restores: np.ndarray = array("N", dtype=bool, option="origin_restores_stamina")  # stamina
+    reward_goal: np.ndarray = array("N", dtype=np.float64, option="reward_goal")
+    reward_fall_off: np.ndarray = array("N", dtype=np.float64, option="reward_fall_off")
+    reward_progress: np.ndarray = array("N", dtype=np.float64, option="reward_path_progress")
+    reward_dense: np.ndarray = array("N", dtype=np.float64, option="reward_path_progress_dense")
+    reward_step: np.ndarray = array("N", dtype=np.float64, option="reward_step")
 
 
 def make_path_room(s: State, steps: int, segments: int) -> bool:

@@ -4,36 +4,21 @@ Shape letters: n lanes, V entries of a vector, t tiles of the lanes' trails.
 """
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from memory_gym_envs.appearance import (
-    CORNERS,
-    LARGEST_RADIUS,
-    AppearanceTables,
-    View,
-    covered,
-    make_appearance_tables,
-    write_agent_entries,
-)
-from memory_gym_envs.character import FACINGS, PAD, SPAN, radius_of, sprites
+from memory_gym_envs.appearance import CORNERS, AppearanceTables, VectorTables, View, tables_of, vector_tables
+from memory_gym_envs.character import FACINGS, LARGEST_RADIUS, PAD, PIXELS, SPAN, sprites
 from memory_gym_envs.drawing import RED, SCREEN
-from memory_gym_envs.entries import Entries, vector_slices
-from memory_gym_envs.mystery_path.drawing import (
-    CROSS,
-    STAMINA_BAR,
-    cross_mask,
-    ground_rows,
-    place_on_screen,
-    spent_stamina,
-    tile_centres,
-    trail_on_screen,
-)
+from memory_gym_envs.mystery_path import drawing
+from memory_gym_envs.mystery_path.drawing import CROSS, STAMINA_BAR
 from memory_gym_envs.mystery_path.options import SIDE, TILE
 from memory_gym_envs.mystery_path.state import State
+from memory_gym_envs.state import Lanes
+from memory_gym_envs.variant import Variant
 
-CROSS_ROW_FITS = abs(np.arange(SPAN) - PAD - SCREEN // 2) < (SCREEN + CROSS) // 2  # of stored positions along y
+CROSS_ROW_FITS = abs(PIXELS - SCREEN // 2) < (SCREEN + CROSS) // 2  # of stored positions along y
 
 
 class ViewOptions(NamedTuple):
@@ -45,20 +30,18 @@ class ViewOptions(NamedTuple):
     width: int  # pixels of the screen that are left of the stamina bar
 
 
-class VectorTables(NamedTuple):
-    """What writing the vectors of one environment needs besides the state."""
+def view_options_of(values: dict[str, Any], scale: float, endless: bool) -> ViewOptions:
+    """What the reset options mean for an agent of this size."""
+    if not endless:
+        return ViewOptions(scale, None, 0, SCREEN)
+    figure_x, cross_x = drawing.camera_columns(values)
+    return ViewOptions(scale, figure_x, cross_x - figure_x, SCREEN - STAMINA_BAR * values["show_stamina"])
 
-    appearance: AppearanceTables
-    at: dict[str, slice]  # where each group of entries is
-    width: int  # V
-    large: bool  # whether some agent is wider than a tile, and so may hide one
 
-
-def make_vector_tables(entries: tuple[Entries, ...], view_options: tuple[ViewOptions, ...]) -> VectorTables:
-    """Prepares the vectors of an id with these entries, for lanes with these view options."""
-    large = any(2 * radius_of(options.scale) > TILE for options in view_options)
-    width = sum(each.width for each in entries)
-    return VectorTables(appearance_tables(view_options), vector_slices(entries), width, large)
+def make_vector_tables(variant: Variant, view_options: tuple[ViewOptions, ...], view: np.ndarray) -> VectorTables:
+    """The tables for lanes with view_options[view], view (N,)."""
+    scales = [options.scale for options in view_options]
+    return vector_tables(variant.entries, appearance_tables(view_options), view * (2 * FACINGS), scales, TILE)
 
 
 @lru_cache(maxsize=16)
@@ -73,7 +56,7 @@ def appearance_tables(view_options: tuple[ViewOptions, ...]) -> AppearanceTables
         image, solid = sprites(options.scale)
         for picture in ((image, solid), with_cross(image, solid, options.aside)):
             views.append(View(options.scale, *picture, free, columns, rows))
-    return make_appearance_tables(views)
+    return tables_of(views)
 
 
 def with_cross(image: np.ndarray, solid: np.ndarray, aside: int) -> tuple[np.ndarray, np.ndarray]:
@@ -83,17 +66,16 @@ def with_cross(image: np.ndarray, solid: np.ndarray, aside: int) -> tuple[np.nda
     image, solid = np.pad(image, (*around, (0, 0))), np.pad(solid, around)
     first = solid.shape[1] // 2 - CROSS // 2
     square = (slice(None), slice(first, first + CROSS), slice(first + aside, first + aside + CROSS))
-    image[square][:, cross_mask()], solid[square][:, cross_mask()] = RED, True
+    image[square][:, drawing.cross_mask()], solid[square][:, drawing.cross_mask()] = RED, True
     return image, solid
 
 
-def make_vectors(s: State, tables: VectorTables, lanes: np.ndarray | slice, endless: bool) -> np.ndarray:
+def make_vectors(s: State, tables: VectorTables, lanes: Lanes, endless: bool) -> np.ndarray:
     """Fresh vector observations of the lanes, (n, V) float32."""
-    at, shows_cross = tables.at, s.shows_cross[lanes]
-    pos = place_on_screen(s, lanes, endless)
-    sprite = (2 * s.view[lanes] + shows_cross) * FACINGS + s.facing[lanes]  # (n,)
+    at, shows_cross, pos = tables.at, s.shows_cross[lanes], drawing.place_on_screen(s, lanes, endless)
+    sprite = tables.lane_sprite[lanes] + shows_cross * FACINGS + s.facing[lanes]  # (n,)
     out = np.zeros((len(sprite), tables.width), np.float32)
-    write_agent_entries(out[:, at["size"].start : at["facing"].stop], tables.appearance, sprite, pos)
+    tables.write_agents(out, sprite, pos)
     if endless:
         write_endless(out, s, tables, lanes, sprite, pos)
     else:
@@ -103,20 +85,18 @@ def make_vectors(s: State, tables: VectorTables, lanes: np.ndarray | slice, endl
     return out
 
 
-def write_ends(
-    out: np.ndarray, s: State, lanes: np.ndarray | slice, appearance: AppearanceTables, sprite: np.ndarray
-) -> None:
+def write_ends(out: np.ndarray, s: State, lanes: Lanes, appearance: AppearanceTables, sprite: np.ndarray) -> None:
     """Writes where the path's origin and goal are, if they are shown and not hidden. out: (n, 4), zeros so far."""
     which, last = np.arange(len(out)), s.path_length[lanes]
     for end, shown, step in ((0, s.show_origin[lanes], np.ones_like(last)), (2, s.show_goal[lanes], last)):
-        centre = tile_centres(s.path_cell[lanes][which, step])  # (n, 2)
+        centre = drawing.tile_centres(s.path_cell[lanes][which, step])  # (n, 2)
         points = centre[:, None] - TILE // 2 + CORNERS * (TILE - 1)  # (n, 4, 2)
-        shown = shown & ~covered(appearance, sprite, s.pos[lanes], points).all(axis=1)
+        shown = shown & ~appearance.covered(sprite, s.pos[lanes], points).all(axis=1)
         out[:, end : end + 2] = (centre - PAD) / SCREEN * shown[:, None]
 
 
 def write_endless(
-    out: np.ndarray, s: State, tables: VectorTables, lanes: np.ndarray | slice, sprite: np.ndarray, pos: np.ndarray
+    out: np.ndarray, s: State, tables: VectorTables, lanes: Lanes, sprite: np.ndarray, pos: np.ndarray
 ) -> None:
     """Writes the endless id's entries except the agent's. out: (n, V). sprite, pos: (n,) and (n, 2), the agents'."""
     at, shows_cross = tables.at, s.shows_cross[lanes]
@@ -126,27 +106,24 @@ def write_endless(
         agent = (sprite, pos) if tables.large else None
         write_trail(out[:, at["past"].start : at["scroll"].stop], s, lanes, tables.appearance, agent)
     if np.count_nonzero(s.extras[lanes]):
-        out[:, at["ground"].start] = ground_rows(s, lanes) / TILE
+        out[:, at["ground"].start] = drawing.ground_rows(s, lanes) / TILE
         out[:, at["bar"].start] = s.show_stamina[lanes]
-        out[:, at["stamina"].start] = s.show_stamina[lanes] * (1 - spent_stamina(s, lanes) / SCREEN)
+        out[:, at["stamina"].start] = s.show_stamina[lanes] * (1 - drawing.spent_stamina(s, lanes) / SCREEN)
 
 
 def write_trail(
-    out: np.ndarray,
-    s: State,
-    lanes: np.ndarray | slice,
-    appearance: AppearanceTables,
-    agent: tuple[np.ndarray, np.ndarray] | None,
+    out: np.ndarray, s: State, lanes: Lanes, appearance: AppearanceTables, agent: tuple[np.ndarray, np.ndarray] | None
 ) -> None:
     """Writes which tiles of the trails show, and their scroll. A tile shows if one of its corners does.
 
     out: (n, 57), zeros so far. agent: sprites (n,) and positions (n, 2) of agents that may hide a tile, or None.
     """
-    owner, x, y = trail_on_screen(s, lanes)
+    owner, x, y = drawing.trail_on_screen(s, lanes)
     inset, width = 0, SCREEN
     if np.count_nonzero(s.extras[lanes]):
         # The background has the same borders, which may be two columns wide, but not the pixels inside them.
-        inset, width = 2 * s.show_ground[lanes][owner], (SCREEN - STAMINA_BAR * s.show_stamina[lanes])[owner]  # (t,)
+        inset = 2 * s.show_ground[lanes][owner]  # (t,)
+        width = (SCREEN - STAMINA_BAR * s.show_stamina[lanes])[owner]  # (t,)
     shown = (x + inset < width) & (x + (TILE - 1) - inset >= 0)
     cut = x == 1 - TILE  # only its last column is on the screen, in the screen's first
     if np.count_nonzero(cut):
@@ -157,7 +134,7 @@ def write_trail(
         sprite, pos = agent
         corners = np.stack([x, y], axis=1)[:, None] + abs(CORNERS * (TILE - 1) - np.reshape(inset, (-1, 1, 1)))
         free = (corners[..., 0] >= 0) & (corners[..., 0] < np.reshape(width, (-1, 1)))  # (t, 4)
-        shown &= (free & ~covered(appearance, sprite[owner], pos[owner], corners + PAD)).any(axis=1)
+        shown &= (free & ~appearance.covered(sprite[owner], pos[owner], corners + PAD)).any(axis=1)
     owner, x, y = owner[shown], x[shown], y[shown]
     out[owner, (x // TILE + 1) * SIDE + y // TILE] = 1.0
     # If the camera is between two pixels, the tiles of a trail differ in this by one: the largest counts.

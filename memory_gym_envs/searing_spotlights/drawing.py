@@ -26,16 +26,8 @@ from memory_gym_envs.drawing import (
     read_only,
     ring,
 )
-from memory_gym_envs.searing_spotlights.state import (
-    ABOVE_BAR,
-    BELOW_BAR,
-    COIN,
-    EXIT,
-    FADE,
-    GONE,
-    UNDER,
-    State,
-)
+from memory_gym_envs.searing_spotlights.state import ABOVE_BAR, BELOW_BAR, COIN, EXIT, FADE, GONE, UNDER, State
+from memory_gym_envs.state import Lanes
 
 TILE = 12  # pixels; the floor is a chessboard
 TOP_BAR = 4  # rows of the top bar
@@ -171,7 +163,6 @@ def set_pictures(s: State, lanes: np.ndarray, values: dict[str, Any]) -> None:
     coins, exit_, agent = values["coins_visible"], values.get("exit_visible", False), values["agent_visible"]
     plain = WHITE_FLOOR if values["hide_chessboard"] else BLUE_FLOOR
     alarm = RED_FLOOR if plain == BLUE_FLOOR and values["visual_feedback"] else plain
-    s.rim[lanes] = values["black_background"]
     s.floors[lanes] = BLACK_FLOOR if values["black_background"] else (plain, alarm)
     s.darkness[lanes] = opacity = fading(values["light_dim_off_duration"], values["light_threshold"])
     # Rims are blended like dimmed pixels, so with rims the darkness is never just black.
@@ -209,7 +200,7 @@ class DrawingTables(NamedTuple):
     scratch: np.ndarray  # (N, 588) scratch for pixels()
 
 
-def draw(s: State, drawing: DrawingTables, lanes: np.ndarray | slice) -> np.ndarray:
+def draw(s: State, drawing: DrawingTables, lanes: Lanes) -> np.ndarray:
     """Fresh frames of the lanes, (n, 84, 84, 3) uint8, drawn from the state alone."""
     dim = (s.length < s.dark_at)[lanes]  # (n,) the darkness is not just black
     frames = draw_in_full_light(s, drawing, lanes, s.near_light[lanes] | dim)
@@ -227,14 +218,12 @@ def draw(s: State, drawing: DrawingTables, lanes: np.ndarray | slice) -> np.ndar
     return frames.reshape(-1, SCREEN, SCREEN, 3)
 
 
-def bar_rows(s: State, lanes: np.ndarray | slice) -> np.ndarray:
+def bar_rows(s: State, lanes: Lanes) -> np.ndarray:
     """(n,) which of bars() the lanes show."""
     return s.first_bar[lanes] + (3 * s.shown_action[lanes] + s.shown_gain[lanes]) * WIDTHS + s.lost_width[lanes]
 
 
-def draw_in_full_light(
-    s: State, drawing: DrawingTables, lanes: np.ndarray | slice, seen: np.ndarray | bool
-) -> np.ndarray:
+def draw_in_full_light(s: State, drawing: DrawingTables, lanes: Lanes, seen: np.ndarray | bool) -> np.ndarray:
     """The lanes in full light: (n, FRAME) uint8. seen: (n,) bool which agents are drawn; True: all."""
     frames = s.scenery.take(s.floor[lanes], axis=0)
     draw_agents(s, drawing, lanes, frames, seen)
@@ -249,9 +238,7 @@ def draw_scenery(s: State, drawing: DrawingTables, lane: int) -> None:
     s.scenery[2 * lane : 2 * lane + 2] = frames
 
 
-def draw_coins(
-    s: State, drawing: DrawingTables, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool
-) -> None:
+def draw_coins(s: State, drawing: DrawingTables, lanes: Lanes, frames: np.ndarray, shown: np.ndarray | bool) -> None:
     """Draws coins into the frames (n, FRAME), in place. shown: (n,) bool in which lanes; True: in all."""
     sprite = s.coin_sprite[lanes]
     for coin in range(COIN, s.bodies.shape[2]):
@@ -259,18 +246,14 @@ def draw_coins(
         paste_shown(frames, drawing.coins_and_exits, sprite, pos, shown & (pos[:, 0] != GONE))
 
 
-def draw_exits(
-    s: State, drawing: DrawingTables, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool
-) -> None:
+def draw_exits(s: State, drawing: DrawingTables, lanes: Lanes, frames: np.ndarray, shown: np.ndarray | bool) -> None:
     """Draws exits into the frames (n, FRAME), in place. shown: (n,) bool in which lanes; True: in all."""
     pos = s.bodies[:, lanes, EXIT].T  # (n, 2)
     sprite = (s.coin_sprite + s.is_open)[lanes] + 1
     paste_shown(frames, drawing.coins_and_exits, sprite, pos, shown & (pos[:, 0] != GONE))
 
 
-def draw_agents(
-    s: State, drawing: DrawingTables, lanes: np.ndarray | slice, frames: np.ndarray, shown: np.ndarray | bool
-) -> None:
+def draw_agents(s: State, drawing: DrawingTables, lanes: Lanes, frames: np.ndarray, shown: np.ndarray | bool) -> None:
     """Draws agents into the frames (n, FRAME), in place. shown: (n,) bool in which lanes; True: in all."""
     if shown is True or np.count_nonzero(shown):
         paste_shown(frames, drawing.figures, (s.figure * FACINGS + s.drawn_facing)[lanes], s.pos[lanes], shown)
@@ -286,13 +269,13 @@ def paste_shown(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndar
         paste(frames, sheet, rows[at], pos[at], at)
 
 
-def draw_layer(s: State, drawing: DrawingTables, lanes: np.ndarray | slice, frames: np.ndarray, layer: int) -> None:
+def draw_layer(s: State, drawing: DrawingTables, lanes: Lanes, frames: np.ndarray, layer: int) -> None:
     """Draws the exits and agents that belong to this layer, which the darkness does not cover."""
     draw_exits(s, drawing, lanes, frames, s.exit_layer[lanes] == layer)
     draw_agents(s, drawing, lanes, frames, s.agent_layer[lanes] == layer)
 
 
-def light_masks(s: State, tables: SpotStencils, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
+def light_masks(s: State, tables: SpotStencils, lanes: Lanes) -> tuple[np.ndarray, np.ndarray | None]:
     """Masks of what the spotlights light and of their visible rims (None: no lane has rims), (n, 588) uint16 each."""
     key = s.spot_place[:, lanes, : int(s.num_spots.max())].transpose(0, 2, 1).copy()  # (2, S, n)
     lit, rim = overlay(tables.disks.at(*key), tables.rims, key, s.rim[lanes])
@@ -318,12 +301,7 @@ def overlay(
 
 
 def darken(
-    s: State,
-    lanes: np.ndarray | slice,
-    frames: np.ndarray,
-    lit: np.ndarray,
-    rim: np.ndarray | None,
-    dim: np.ndarray,
+    s: State, lanes: Lanes, frames: np.ndarray, lit: np.ndarray, rim: np.ndarray | None, dim: np.ndarray
 ) -> None:
     """Darkens the lanes' frames, (n, FRAME), in place.
 

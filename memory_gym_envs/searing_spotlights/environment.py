@@ -2,45 +2,22 @@
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.base import DEBUG_ZOOM, NO_LIMIT, MemoryGymVectorEnv, limit_of, numbered
+from memory_gym_envs.base import DEBUG_ZOOM, NO_LIMIT
 from memory_gym_envs.bits import PLACE_0, PLACES, pixel_scratch
-from memory_gym_envs.character import PAD, SPAN, STRIDES, Figure, agent_tables, free_controls, radius_of, walk
+from memory_gym_envs.character import PAD, Figure
 from memory_gym_envs.drawing import GREEN, SCREEN, magnify, ring
-from memory_gym_envs.searing_spotlights.drawing import (
-    TOP_BAR,
-    DrawingTables,
-    bars,
-    coin_and_exit_sheet,
-    draw,
-    draw_in_full_light,
-    draw_scenery,
-    set_pictures,
-    spot_stencils,
-)
-from memory_gym_envs.searing_spotlights.levels import sample_coin, sample_delay, sample_level, sample_spot, write_level
+from memory_gym_envs.searing_spotlights import drawing, levels, rules, vectors
+from memory_gym_envs.searing_spotlights.drawing import TOP_BAR
 from memory_gym_envs.searing_spotlights.options import VARIANTS
-from memory_gym_envs.searing_spotlights.rules import (
-    add_spot,
-    burn,
-    coin_show_limit,
-    count_step,
-    leave,
-    move_spots,
-    place_coin,
-    set_rules,
-    take_coins,
-    touched_bodies,
-)
 from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, RADIUS, State
-from memory_gym_envs.searing_spotlights.vectors import make_vectors, vector_tables
-from memory_gym_envs.state import empty, make_room
+from memory_gym_envs.state import Lanes, empty, make_room
+from memory_gym_envs.walking import WalkingVectorEnv, numbered
 from memory_gym_envs.words import words
 
 
-class SearingSpotlights(MemoryGymVectorEnv):
+class SearingSpotlights(WalkingVectorEnv):
     """Searing Spotlights (thesis 4.5): collect coins and leave in the dark, away from wandering spotlights.
 
     ## Description
@@ -56,18 +33,14 @@ class SearingSpotlights(MemoryGymVectorEnv):
 
     ## Action Space
 
-    `MultiDiscrete([3, 3])`:
-
-    | value | horizontal | vertical |
-    |---|---|---|
-    | 0 | none | none |
-    | 1 | left | up |
-    | 2 | right | down |
+    | space | 0 | 1 | 2 |
+    |---|---|---|---|
+    | `MultiDiscrete([3, 3])`, horizontal | none | left | right |
+    | and vertical | none | up | down |
 
     ## Observation Space
 
-    `Box(0, 255, (84, 84, 3), uint8)`, rows first. With obs_type="grayscale" the same pictures in one channel,
-    (84, 84, 1). With obs_type="vector" a flat float32 vector: `docs/vectors.md`, `VARIANTS[id].entries`.
+    `Box(0, 255, (84, 84, 3), uint8)`, rows first. Other values of `obs_type` change that: see Arguments.
 
     ## Rewards
 
@@ -124,92 +97,82 @@ class SearingSpotlights(MemoryGymVectorEnv):
     """
 
     variants = VARIANTS
-    tables = ("_agent_tables", "_drawing", "_vector_tables")
+    tables = (*WalkingVectorEnv.tables, "_drawing")
     truth_high = (SCREEN + 2) / SCREEN  # an agent may start that far outside of the screen
-    kept = (*MemoryGymVectorEnv.kept, "_unlocked")
-
-    def spaces(self) -> tuple[gym.Space, gym.Space]:
-        """The observation space of one lane with pixels, and its action space."""
-        return gym.spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8), gym.spaces.MultiDiscrete([3, 3])
+    kept = (*WalkingVectorEnv.kept, "_unlocked")
 
     def allocate(self) -> None:
         """Makes the state of N lanes, with room for no coin and one spotlight."""
         self.state = empty(State, N=self.num_envs, S=1, B=COIN, R=2 * self.num_envs)
-        self._number_sprites()
         self._unlocked: list[int] = []  # lanes without coins, whose exits open in the first step
-        self.place_tables()
 
     def configure(self, lanes: np.ndarray) -> None:
-        """Takes over the options of the lanes, and the tables that all lanes' options need."""
-        values, endless = self.settings[int(lanes[0])], self.variant.endless
-        make_room(self.state, "B", COIN + (1 if endless else max((1, *values["num_coins"]))))
-        set_rules(self.state, lanes, values, endless)
-        set_pictures(self.state, lanes, values)
-        self._number_sprites()
-        self.place_tables()
+        """Takes over the options of the lanes that mean more than a number, and makes room for the coins."""
+        values = self.settings[int(lanes[0])]
+        make_room(self.state, "B", COIN + max((1, *values.get("num_coins", ()))))
+        rules.set_rules(self.state, lanes, values)
+        drawing.set_pictures(self.state, lanes, values)
 
-    def _number_sprites(self) -> None:
-        """Numbers the different figures, coins and exits of all lanes' options."""
-        self.figures, figure = numbered([figures_of(values) for values in self.settings])
-        self.scales, scale = numbered([scales_of(values) for values in self.settings])
-        # There are two of each figure, for x and y: the bar makes the ground less high than wide.
-        self.state.figure[:] = [2 * each for each in figure]
-        self.state.coin_sprite[:] = [3 * each for each in scale]
+    def figures_of(self, values: dict[str, Any]) -> tuple[Figure, ...]:
+        """The agent's figure as it walks across and as it walks down, where the bar is in its way."""
+        return self.figure_of(values, 0, SCREEN), self.figure_of(values, TOP_BAR, SCREEN)
 
     def place_tables(self) -> None:
         """The tables that step() looks things up in, and where each lane's rows start in them."""
-        self._agent_tables = agent_tables(tuple(figure for pair in self.figures for figure in pair))
+        coins = [values["coin_scale"] for values in self.settings]
+        exits = [values.get("exit_scale", values["coin_scale"]) for values in self.settings]
+        self.scales, scale = numbered([*zip(coins, exits, strict=True)])
+        self.state.coin_sprite[:] = np.multiply(scale, 3)
         every = [values[name] for values in self.settings for name in ("spot_min_radius", "spot_max_radius")]
-        radii = int(min(every)), int(max(every))
-        self._drawing = DrawingTables(
-            spots=spot_stencils(*radii),
+        self._radii = int(min(every)), int(max(every))  # the smallest and the largest
+        super().place_tables()
+        self._drawing = drawing.DrawingTables(
+            spots=drawing.spot_stencils(*self._radii),
             figures=self._agent_tables.sheet,
-            coins_and_exits=coin_and_exit_sheet(self.scales),
-            bars=bars(self.variant.endless),
+            coins_and_exits=drawing.coin_and_exit_sheet(self.scales),
+            bars=drawing.bars(self.variant.endless),
             scratch=pixel_scratch(self.num_envs),
         )
-        if self.obs_type == "vector":
-            figure_scales = tuple(across.scale for across, _ in self.figures)
-            has_hands = [int(10 * values["agent_scale"]) > 0 for values in self.settings]
-            self._vector_tables = vector_tables(self.state, self.variant, radii, figure_scales, self.scales, has_hands)
-        self._controls = free_controls()
         self._calm = np.arange(0, 2 * self.num_envs, 2)  # (N,) the scenery's calm rows
-        self._lane_walk = (self.state.figure[:, None] + np.arange(2)) * (STRIDES * SPAN)  # (N, 2)
+
+    def vector_tables(self) -> vectors.VectorTables:
+        """The tables of vector observations."""
+        figure_scales = tuple(across.scale for across in self.figures[::2])
+        return vectors.make_vector_tables(self.state, self.variant, self._radii, figure_scales, self.scales)
 
     def begin(self, lanes: np.ndarray) -> None:
         """Samples the lanes' next levels and starts their episodes."""
         for lane in lanes.tolist():
             values = self.settings[lane]
-            spawns = NO_LIMIT if self.variant.endless else limit_of(values["num_spawns"])
-            level = sample_level(self._rngs[lane], values, self.variant)
-            write_level(self.state, lane, level, spawns, coin_show_limit(values, first=True))
+            spawns = NO_LIMIT if self.variant.endless else values["num_spawns"]
+            level = levels.sample_level(self._rngs[lane], values, self.variant)
+            levels.write_level(self.state, lane, level, spawns, rules.coin_show_limit(values, first=True))
             self._draw_scenery(lane)
             if not level.coins:
                 self._unlocked.append(lane)
 
-    def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """One step of the rules: walk, spawn, shine, burn, collect, leave."""
+    def apply_rules(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Walks, spawns, shines, burns, collects, leaves: rewards and terminations, (N,) each."""
         s, endless = self.state, self.variant.endless
-        s.length += 1
-        self._move(actions)
+        self._move(action)
         self._unlock()
         self._spawn()
-        hit = move_spots(s)
+        hit = rules.move_spots(s)
         rewards, terminated, s.floor = s.reward_outside.copy(), np.zeros(self.num_envs, bool), self._calm.copy()
         if np.count_nonzero(hit):
-            burn(s, np.flatnonzero(hit), rewards, terminated)
-        touched, shown = touched_bodies(s), {}
+            rules.burn(s, np.flatnonzero(hit), rewards, terminated)
+        touched, shown = rules.touched_bodies(s), {}
         if np.count_nonzero(touched):
             shown = self._collect(touched, rewards)
             if not endless:
-                leave(s, touched, rewards, terminated)
-        return rewards, terminated, count_step(s, rewards, terminated, shown, endless)
+                rules.leave(s, touched, rewards, terminated)
+        rules.count_step(s, rewards, terminated, shown, endless)
+        return rewards, terminated
 
-    def _move(self, actions: np.ndarray) -> None:
+    def _move(self, action: np.ndarray) -> None:
         s = self.state
-        action = actions[:, 0] * 3 + actions[:, 1]  # (N,)
         s.shown_action, s.last_action = s.last_action, action
-        s.facing, s.pos = walk(s.facing, s.pos, action, self._lane_walk, self._controls, self._agent_tables.walk)
+        self.move_agents(action)
         s.drawn_facing = s.facing
         np.subtract(s.pos.T, PAD, out=s.bodies[:, :, AGENT])
 
@@ -228,7 +191,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
         if np.count_nonzero(due):
             for lane in np.flatnonzero(due).tolist():
                 rng, values = self._rngs[lane], self.settings[lane]
-                add_spot(s, lane, sample_spot(rng, values), sample_delay(rng, values))
+                rules.add_spot(s, lane, levels.sample_spot(rng, values), levels.sample_delay(rng, values))
 
     def _collect(self, touched: np.ndarray, rewards: np.ndarray) -> dict[int, float]:
         """Takes the coins that are touched, (N, B) bool; the endless id then has a new one.
@@ -240,28 +203,28 @@ class SearingSpotlights(MemoryGymVectorEnv):
             last, values = tuple(s.bodies[:, lane, COIN].tolist()), self.settings[lane]
             if self.variant.endless and not values["coin_feedback"]:
                 shown[lane] = float(rewards[lane])
-            rewards[lane] += s.reward_coin[lane] * take_coins(s, lane, touched[lane])
+            rewards[lane] += s.reward_coin[lane] * rules.take_coins(s, lane, touched[lane])
             if self.variant.endless:
-                place = sample_coin(words(self._rngs[lane]), last)
-                place_coin(s, lane, place, coin_show_limit(values, first=False))
+                place = levels.sample_coin(words(self._rngs[lane]), last)
+                rules.place_coin(s, lane, place, rules.coin_show_limit(values, first=False))
             self._draw_scenery(lane)
         return shown
 
     def _draw_scenery(self, lane: int) -> None:
         """Draws the lane's scenery again. Vectors need none; frames() draws it then."""
         if self.obs_type != "vector":
-            draw_scenery(self.state, self._drawing, lane)
+            drawing.draw_scenery(self.state, self._drawing, lane)
 
-    def frames(self, lanes: np.ndarray | slice) -> np.ndarray:
+    def frames(self, lanes: Lanes) -> np.ndarray:
         """Fresh frames of the lanes, (n, 84, 84, 3)."""
         if self.obs_type == "vector":
             for lane in np.arange(self.num_envs)[lanes].tolist():
-                draw_scenery(self.state, self._drawing, lane)
-        return draw(self.state, self._drawing, lanes)
+                drawing.draw_scenery(self.state, self._drawing, lane)
+        return drawing.draw(self.state, self._drawing, lanes)
 
-    def vectors(self, lanes: np.ndarray | slice) -> np.ndarray:
+    def vectors(self, lanes: Lanes) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32: see VARIANTS[id].entries."""
-        return make_vectors(self.state, self._vector_tables, lanes)
+        return vectors.make_vectors(self.state, self._vector_tables, lanes)
 
     def ground_truth(self) -> np.ndarray:
         """A fresh (N, 6), or (N, 4) in the endless id: the agent's, the coin's and the exit's x and y, over 84."""
@@ -274,8 +237,7 @@ class SearingSpotlights(MemoryGymVectorEnv):
 
     def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
         """The lanes' ended episodes in numbers."""
-        s = self.state
-        numbers = {"reward": s.episode_return[lanes], "length": s.length[lanes]}
+        s, numbers = self.state, super().summary(lanes)
         numbers["agent_health"] = (s.health / s.full_health)[lanes]
         if self.variant.endless:
             return numbers | {"coins_collected": s.collected[lanes]}
@@ -285,25 +247,23 @@ class SearingSpotlights(MemoryGymVectorEnv):
         return numbers | {"coins_collected": share, "success": success, "is_success": success == 1}
 
     def oracle(self) -> dict[str, np.ndarray]:
-        """The whole task in plain numbers, fresh arrays (N, ...). Besides `seed` and `length`:
+        """The whole task in plain numbers, fresh arrays (N, ...). Besides `seed`, `length` and `position`:
 
-        `position` (N, 2), the agent's centre in pixels, x and y; `coins` (N, C, 2), the coins', NaN where one is gone;
-        `coins_left` and `coins_collected` (N,); `health` (N,); in the finite id `exit` (N, 2), NaN where there is none,
-        and `exit_is_open` (N,) bool.
+        `coins` (N, C, 2), where they are in pixels, x and y, NaN where one is gone; `coins_left` and `coins_collected`
+        (N,); `health` (N,); in the finite id `exit` (N, 2), NaN where there is none, and `exit_is_open` (N,) bool.
         """
         s = self.state
         places = np.where(s.bodies == GONE, np.nan, s.bodies).transpose(1, 2, 0)  # (N, B, 2)
-        numbers = {"position": s.bodies[:, :, AGENT].T.copy(), "coins": places[:, COIN:]}
-        numbers |= {"coins_left": s.coins_left.copy(), "coins_collected": s.collected.copy()}
-        numbers["health"] = s.health.copy()
+        numbers = super().oracle() | {"coins": places[:, COIN:], "coins_left": s.coins_left.copy()}
+        numbers |= {"coins_collected": s.collected.copy(), "health": s.health.copy()}
         if not self.variant.endless:
             numbers |= {"exit": places[:, EXIT], "exit_is_open": s.is_open == 1}
-        return super().oracle() | numbers
+        return numbers
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Lights everything below the bar, and circles the spotlights."""
         s, lanes = self.state, np.array([lane])
-        lit = draw_in_full_light(s, self._drawing, lanes, True)
+        lit = drawing.draw_in_full_light(s, self._drawing, lanes, True)
         below = slice(TOP_BAR * DEBUG_ZOOM, None)
         frame[below] = magnify(lit.reshape(SCREEN, SCREEN, 3), DEBUG_ZOOM)[below]
         for slot in np.flatnonzero(s.spot_place[0, lane]).tolist():
@@ -312,15 +272,3 @@ class SearingSpotlights(MemoryGymVectorEnv):
             circle = ring(len(frame), x * DEBUG_ZOOM, y * DEBUG_ZOOM, radius * DEBUG_ZOOM, DEBUG_ZOOM)
             circle[: TOP_BAR * DEBUG_ZOOM] = False
             frame[circle] = GREEN
-
-
-def figures_of(values: dict[str, Any]) -> tuple[Figure, Figure]:
-    """The agent's figure as it walks across and as it walks down, where the bar is in its way."""
-    scale, speed = values["agent_scale"], values["agent_speed"]
-    across, down = (Figure(scale, speed, low, SCREEN, radius_of(scale), False) for low in (0, TOP_BAR))
-    return across, down
-
-
-def scales_of(values: dict[str, Any]) -> tuple[float, float]:
-    """The scales of coin and exit."""
-    return values["coin_scale"], values.get("exit_scale", values["coin_scale"])

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from memory_gym_envs.base import ALL, NO_LIMIT, limit_of
+from memory_gym_envs.base import ALL, NO_LIMIT
 from memory_gym_envs.bits import PLACE_0, PLACES
 from memory_gym_envs.character import radius_of
 from memory_gym_envs.drawing import SCREEN
@@ -27,26 +27,12 @@ from memory_gym_envs.searing_spotlights.state import (
 )
 from memory_gym_envs.state import make_room
 
-# Fields of the state that hold an option as it is.
-SAME = {
-    "full_health": "agent_health",
-    "damage": "spot_damage",
-    "reward_inside": "reward_inside_spotlight",
-    "reward_outside": "reward_outside_spotlight",
-    "reward_death": "reward_death",
-    "reward_coin": "reward_coin",
-    "reward_exit": "reward_exit",
-}
 
-
-def set_rules(s: State, lanes: np.ndarray, values: dict[str, Any], endless: bool) -> None:
+def set_rules(s: State, lanes: np.ndarray, values: dict[str, Any]) -> None:
     """Writes what the options mean for the rules to the state of these lanes, (n,)."""
-    for field, name in SAME.items():
-        getattr(s, field)[lanes] = values.get(name, 0)
-    s.step_limit[lanes] = limit_of(values["max_steps"])
-    s.coin_limit[lanes] = limit_of(values["steps_per_coin"] if endless and values["coin_enabled"] else -1)
-    waits = ("spawn_interval",) if endless else ("initial_spawn_interval", "spawn_interval_threshold")
-    s.spawn_interval[lanes] = max(1, sum(values[name] for name in waits))
+    s.coin_limit[lanes] = values["steps_per_coin"] if values.get("coin_enabled") else -1
+    waits = ("spawn_interval", "initial_spawn_interval", "spawn_interval_threshold")
+    s.spawn_interval[lanes] = max(1, sum(values.get(name, 0) for name in waits))
     radius = radius_of(values["agent_scale"])
     coin, exit_ = int(10 * values["coin_scale"]), 10 * values.get("exit_scale", 0.0)
     s.touch_squared[lanes, COIN:], s.touch_squared[lanes, EXIT] = (coin + radius) ** 2, (exit_ + radius) ** 2
@@ -201,10 +187,8 @@ def leave(s: State, touched: np.ndarray, rewards: np.ndarray, terminated: np.nda
 # ---- counting ----
 
 
-def count_step(
-    s: State, rewards: np.ndarray, terminated: np.ndarray, shown: dict[int, float], endless: bool
-) -> np.ndarray:
-    """Counts the step; (N,) bool which episodes are truncated. terminated (N,) changes in place.
+def count_step(s: State, rewards: np.ndarray, terminated: np.ndarray, shown: dict[int, float], endless: bool) -> None:
+    """Counts the step. terminated (N,) changes in place.
 
     shown: by lane, rewards that the top bar shows instead of the lane's own.
     """
@@ -214,5 +198,3 @@ def count_step(
     s.shown_gain, s.last_gain = s.last_gain, (rewards > 0) + 1
     for lane, reward in shown.items():
         s.last_gain[lane] = 1 + (reward > 0)
-    s.episode_return += rewards
-    return (s.length == s.step_limit) & ~terminated

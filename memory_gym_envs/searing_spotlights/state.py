@@ -9,6 +9,7 @@ import numpy as np
 
 from memory_gym_envs.drawing import FRAME
 from memory_gym_envs.state import array
+from memory_gym_envs.walking import WalkingState
 
 AGENT, EXIT, COIN = 0, 1, 2  # bodies; coins are the last ones
 GONE = 180  # the position of bodies that do not exist, in pixels: too far away to be touched or seen
@@ -26,13 +27,10 @@ FADE = 257  # steps after which the darkness no longer changes
 
 
 @dataclass
-class State:
-    """One array a field. `pos` is stored with PAD added, as in the other families."""
+class State(WalkingState):
+    """The lanes' state. Only `pos` is stored with PAD added."""
 
-    pos: np.ndarray = array("N", 2)  # the agent's centre, x and y
-    facing: np.ndarray = array("N")
     drawn_facing: np.ndarray = array("N")  # the facing that is drawn
-    figure: np.ndarray = array("N")  # which of the batch's figures the agent is
     bodies: np.ndarray = array(2, "N", "B", fill=GONE)  # x and y of the agent, the exit and the coins
     touch_squared: np.ndarray = array("N", "B", dtype=np.float64)  # square of the distance at which the agent touches
     coin_sprite: np.ndarray = array("N")  # the sprite of the lane's coin; those of its closed and its open exit follow
@@ -61,16 +59,13 @@ class State:
     shown_action: np.ndarray = array("N")  # that of the step before
     last_gain: np.ndarray = array("N")  # 1, or 2 after a positive reward
     shown_gain: np.ndarray = array("N")  # that of the step before; 0 before the first step
-    length: np.ndarray = array("N")  # steps so far
-    episode_return: np.ndarray = array("N", dtype=np.float64)  # sum of rewards so far
     # Options that the rules or the pictures need at every step.
-    step_limit: np.ndarray = array("N")  # steps until truncation
-    coin_limit: np.ndarray = array("N")  # steps to collect a coin in
+    coin_limit: np.ndarray = array("N")  # steps to collect a coin in; -1: no limit
     spawn_interval: np.ndarray = array("N")  # steps between spotlights, without the delay
-    full_health: np.ndarray = array("N", dtype=np.float64)  # health at the start
-    damage: np.ndarray = array("N", dtype=np.float64)
+    full_health: np.ndarray = array("N", dtype=np.float64, option="agent_health")  # health at the start
+    damage: np.ndarray = array("N", dtype=np.float64, option="spot_damage")
     floors: np.ndarray = array("N", 2)  # rows of floors(): while the agent is in the dark, and in the light
-    rim: np.ndarray = array("N", dtype=bool)  # spotlights have a white rim
+    rim: np.ndarray = array("N", dtype=bool, option="black_background")  # spotlights have a white rim
     darkness: np.ndarray = array("N", FADE, dtype=np.uint8)  # opacity of the dark after so many steps
     dark_at: np.ndarray = array("N")  # steps until it is opaque and nothing else
     reddens: np.ndarray = array("N")  # 1 if the floor is red while the agent is in the light
@@ -78,8 +73,8 @@ class State:
     exit_layer: np.ndarray = array("N")  # UNDER, BELOW_BAR or ABOVE_BAR
     agent_layer: np.ndarray = array("N")  # likewise
     layered: np.ndarray = array("N", dtype=bool)  # either is above the dark
-    reward_inside: np.ndarray = array("N", dtype=np.float64)
-    reward_outside: np.ndarray = array("N", dtype=np.float64)
-    reward_death: np.ndarray = array("N", dtype=np.float64)
-    reward_coin: np.ndarray = array("N", dtype=np.float64)
-    reward_exit: np.ndarray = array("N", dtype=np.float64)
+    reward_inside: np.ndarray = array("N", dtype=np.float64, option="reward_inside_spotlight")
+    reward_outside: np.ndarray = array("N", dtype=np.float64, option="reward_outside_spotlight")
+    reward_death: np.ndarray = array("N", dtype=np.float64, option="reward_death")
+    reward_coin: np.ndarray = array("N", dtype=np.float64, option="reward_coin")
+    reward_exit: np.ndarray = array("N", dtype=np.float64, option="reward_exit")

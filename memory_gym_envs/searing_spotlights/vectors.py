@@ -9,46 +9,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memory_gym_envs.bits import (
-    FULL_ROW,
-    ITEMS,
-    PLACE_0,
-    PLACES,
-    SAMPLE_ROWS,
-    SAMPLE_STEP,
-    Stencils,
-    sample,
-    samples,
-    stencils,
-    sums,
-    tile_counts,
-    unpacked,
-)
+from memory_gym_envs import bits
+from memory_gym_envs.bits import FULL_ROW, ITEMS, PLACE_0, PLACES, SAMPLE_ROWS, SAMPLE_STEP, Stencils
 from memory_gym_envs.character import FACINGS, sprites
 from memory_gym_envs.drawing import BLUE, GREEN, SCREEN, read_only
 from memory_gym_envs.entries import vector_slices
-from memory_gym_envs.searing_spotlights.drawing import (
-    ACTION_COLORS,
-    BLUE_FLOOR,
-    TOP_BAR,
-    YELLOW,
-    bar_rows,
-    bars,
-    draw_coins_and_exits,
-    floors,
-    overlay,
-    spot_shapes,
-)
+from memory_gym_envs.searing_spotlights import drawing
+from memory_gym_envs.searing_spotlights.drawing import ACTION_COLORS, BLUE_FLOOR, TOP_BAR, YELLOW
 from memory_gym_envs.searing_spotlights.state import ABOVE_BAR, AGENT, BELOW_BAR, COIN, EXIT, FADE, UNDER, State
+from memory_gym_envs.state import Lanes
 from memory_gym_envs.variant import Variant
 
 FAINT = 252  # the highest opacity at which an agent, (3, 3, 2) then, still differs from white floor
 SLIGHT = 5  # the highest opacity that may leave some colours as they are
 FIRST_RIM = 51  # the lowest opacity at which a rim differs from all colours under it, if only by 1
 ROWS_BELOW = np.where(np.arange(0, SCREEN, SAMPLE_STEP) < TOP_BAR, np.uint64(0), FULL_ROW)  # (42,) below the bar
-TILE_SHARE = 1 / tile_counts(ROWS_BELOW[None]).astype(np.float32)  # (1, 49)
+TILE_SHARE = 1 / bits.tile_counts(ROWS_BELOW[None]).astype(np.float32)  # (1, 49)
 FULL_SHARE = TILE_SHARE.min()  # of a tile beside the bar
-BLUE_SAMPLE = sample((floors()[BLUE_FLOOR].reshape(SCREEN, SCREEN, 3) == BLUE).all(axis=-1))  # (42,) or the red tiles
+BLUE_TILES = (drawing.floors()[BLUE_FLOOR].reshape(SCREEN, SCREEN, 3) == BLUE).all(axis=-1)  # or the red ones
+BLUE_SAMPLE = bits.sample(BLUE_TILES)  # (42,)
 NO_BITS = np.uint64(0)
 READING = slice(0, 8)  # the entries that are read from the bar
 # By opacity: (256, 2) all bits where the darkness changes nothing, and where it hides nothing; and the brightness of
@@ -60,7 +39,7 @@ DUSK = ((1 - np.arange(256) / 255) * (VEIL[:, 1] > VEIL[:, 0])).astype(np.float3
 @cache
 def readings(endless: bool) -> np.ndarray:
     """(4 * BARS_PER_CHOICE, 8) float32, read-only: what each of bars() says."""
-    return read_only(read_bars(bars(endless).reshape(-1, SCREEN, 3)))
+    return read_only(read_bars(drawing.bars(endless).reshape(-1, SCREEN, 3)))
 
 
 def read_bars(bar: np.ndarray) -> np.ndarray:
@@ -91,18 +70,17 @@ class VectorTables(NamedTuple):
     has_hands: np.ndarray  # (N,) bool: the agent has hands, which show its facing
 
 
-def vector_tables(
+def make_vector_tables(
     s: State,
     variant: Variant,
     radii: tuple[int, int],
     figure_scales: tuple[float, ...],
     scales: tuple[tuple[float, float], ...],
-    has_hands: list[bool],
 ) -> VectorTables:
     """The tables for the lanes of this state.
 
     radii: the smallest and the largest spotlight. figure_scales: of each two figures, which State.figure numbers.
-    scales: of coin and exit, for each three sprites, which State.coin_sprite numbers. has_hands: of each lane.
+    scales: of coin and exit, for each three sprites, which State.coin_sprite numbers.
     """
     first, coins = radii[1] + 1, s.bodies.shape[2] - COIN
     agent = first + s.figure // 2 * FACINGS  # (N,) each
@@ -118,7 +96,7 @@ def vector_tables(
         width=at["alarm"].stop,
         at=at,
         places=slice(at["agent"].start, at["coin"].stop),
-        bars=bars(variant.endless),
+        bars=drawing.bars(variant.endless),
         readings=readings(variant.endless),
         shapes=shapes,
         rims=rims,
@@ -126,7 +104,7 @@ def vector_tables(
         key=np.stack(key) * PLACES + PLACE_0,
         bodies=np.array(bodies),
         coin=1 if variant.endless else COIN,
-        has_hands=np.array(has_hands),
+        has_hands=np.array([int(10 * scale) > 0 for scale in figure_scales])[s.figure // 2],
     )
 
 
@@ -135,13 +113,13 @@ def vector_shapes(
     least: int, largest: int, figure_scales: tuple[float, ...], scales: tuple[tuple[float, float], ...]
 ) -> tuple[Stencils, Stencils, Stencils]:
     """VectorTables' shapes, rims and high. Cached: environments with equal options share them."""
-    disks, rims = spot_shapes(least, largest)
+    disks, rims = drawing.spot_shapes(least, largest)
     figures = [solid for scale in figure_scales for solid in sprites(scale)[1]]
-    images, solids = draw_coins_and_exits(scales)
+    images, solids = drawing.draw_coins_and_exits(scales)
     # An exit's frame is as black as the dark, so only its door is visible.
     things = [each for i in range(0, len(solids), 3) for each in (*solids[i : i + 2], images[i + 1].any(axis=-1))]
     shapes = disks + figures + things
-    return samples(shapes), samples(rims), stencils(shapes, TOP_BAR)
+    return bits.samples(shapes), bits.samples(rims), bits.stencils(shapes, TOP_BAR)
 
 
 class FrameSamples(NamedTuple):
@@ -160,7 +138,7 @@ class FrameSamples(NamedTuple):
     floor: np.ndarray  # what nothing covers
 
 
-def make_vectors(s: State, g: VectorTables, lanes: np.ndarray | slice) -> np.ndarray:
+def make_vectors(s: State, g: VectorTables, lanes: Lanes) -> np.ndarray:
     """The vectors of the lanes, (n, V) float32, from the state alone. No frame is drawn.
 
     They depend on the colours of the bar and of every third pixel below it, so equal frames have equal vectors.
@@ -172,7 +150,7 @@ def make_vectors(s: State, g: VectorTables, lanes: np.ndarray | slice) -> np.nda
     return out
 
 
-def sample_frames(s: State, g: VectorTables, lanes: np.ndarray | slice) -> FrameSamples:
+def sample_frames(s: State, g: VectorTables, lanes: Lanes) -> FrameSamples:
     """The lanes' frames as samples."""
     place, each = s.spot_place[:, lanes, : int(s.num_spots.max())], np.arange(len(s.pos))[lanes]
     spots, has_exit = place.shape[2], g.coin == COIN
@@ -181,7 +159,7 @@ def sample_frames(s: State, g: VectorTables, lanes: np.ndarray | slice) -> Frame
     np.add(s.bodies[:, lanes].transpose(0, 2, 1)[:, g.bodies], g.key[:, lanes], out=key[:, spots:])
     key[:, spots + AGENT] += s.drawn_facing[lanes] * PLACES
     shapes = g.shapes.at(*key)  # (S + K + 1, n, 42)
-    lit, rim = overlay(shapes[:spots], g.rims, key[:, :spots], s.rim[lanes])
+    lit, rim = drawing.overlay(shapes[:spots], g.rims, key[:, :spots], s.rim[lanes])
     opacity = s.darkness[each, np.minimum(s.length[lanes], FADE - 1)]
     veil = VEIL.take(opacity, axis=0)  # (n, 2)
     lit |= veil[:, :1]
@@ -197,7 +175,7 @@ def sample_frames(s: State, g: VectorTables, lanes: np.ndarray | slice) -> Frame
     return FrameSamples(opacity, lit, clear, rim, x, y, raised, layer, cover, seen, floor)
 
 
-def layers(s: State, g: VectorTables, lanes: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray | None]:
+def layers(s: State, g: VectorTables, lanes: Lanes) -> tuple[np.ndarray, np.ndarray | None]:
     """FrameSamples' raised and layer."""
     coins = s.coin_age[lanes] < s.coin_show_limit[lanes]
     (raised,) = (coins | s.layered[lanes]).nonzero()
@@ -230,19 +208,19 @@ def visible_parts_in_layers(cover: np.ndarray, clear: np.ndarray, layer: np.ndar
     return seen_above | seen_below, floor & free
 
 
-def write_bar(s: State, g: VectorTables, lanes: np.ndarray | slice, sampled: FrameSamples, out: np.ndarray) -> None:
+def write_bar(s: State, g: VectorTables, lanes: Lanes, sampled: FrameSamples, out: np.ndarray) -> None:
     """Writes health, actions and reward."""
-    rows = bar_rows(s, lanes)
+    rows = drawing.bar_rows(s, lanes)
     out[:, READING] = g.readings.take(rows, axis=0)
     if sampled.layer is not None and (sampled.layer == ABOVE_BAR).any():
         high, over_bar = sampled.raised, sampled.layer == ABOVE_BAR  # (m,), (K, m, 1)
         cover = g.high.at(sampled.x[:, high], sampled.y[:, high]) * over_bar  # (K, m, words)
         left = ~np.bitwise_or.reduce(cover, axis=0).view(np.uint16).reshape(-1, TOP_BAR, ITEMS)
-        columns = unpacked(np.bitwise_or.reduce(left, axis=1))  # (m, 84) those of which anything is left
+        columns = bits.unpacked(np.bitwise_or.reduce(left, axis=1))  # (m, 84) those of which anything is left
         out[high, READING] = read_bars(g.bars[rows[high]].reshape(-1, SCREEN, 3) * columns[..., None])
 
 
-def write_rest(s: State, g: VectorTables, lanes: np.ndarray | slice, sampled: FrameSamples, out: np.ndarray) -> None:
+def write_rest(s: State, g: VectorTables, lanes: Lanes, sampled: FrameSamples, out: np.ndarray) -> None:
     """Writes the other entries."""
     cover, seen, (bodies, n, _) = sampled.cover, sampled.seen, sampled.seen.shape
     bright, visible, dusk = sampled.lit & sampled.floor, sampled.clear & sampled.floor, DUSK.take(sampled.opacity)
@@ -269,7 +247,7 @@ def write_places(g: VectorTables, seen: np.ndarray, any_: np.ndarray, out: np.nd
     """Writes how much of the bodies is visible, and where. any_: (K, n) whether any is."""
     (bodies, n), kinds = any_.shape, g.coin + 1
     body, lane = any_.nonzero()
-    total = sums(seen[body, lane])  # (hits, 3)
+    total = bits.sums(seen[body, lane])  # (hits, 3)
     if bodies > kinds:
         each = np.zeros((bodies, n, 3), np.float32)
         each[body, lane] = total
@@ -284,11 +262,11 @@ def write_places(g: VectorTables, seen: np.ndarray, any_: np.ndarray, out: np.nd
 def write_tiles(g: VectorTables, seen: np.ndarray, any_: np.ndarray, bright: np.ndarray, out: np.ndarray) -> None:
     """Writes which share of each tile is light and which is coins (not in the endless id). any_: (K, n) as above."""
     if "coins" not in g.at:
-        out[:, g.at["light"]] = tile_counts(bright) * TILE_SHARE
+        out[:, g.at["light"]] = bits.tile_counts(bright) * TILE_SHARE
         return
     lanes = np.flatnonzero(any_[g.coin :].any(axis=0))
     coins = np.bitwise_or.reduce(seen[g.coin :, lanes], axis=0)
-    share = tile_counts(np.concatenate([bright, coins])) * TILE_SHARE
+    share = bits.tile_counts(np.concatenate([bright, coins])) * TILE_SHARE
     out[:, g.at["light"]], out[lanes, g.at["coins"]] = share[: len(bright)], share[len(bright) :]
 
 
