@@ -633,7 +633,7 @@ def test_click_on_a_line(browser, watch):
 
 
 def weights_of_block(block):
-    """The bars of a block's weights: the rows above it are two curves and the actions."""
+    """The marks of a block's highest weights: the rows above it are two curves and the actions."""
     return f"#curves .xy{4 + block} .points .point"
 
 
@@ -642,7 +642,7 @@ def test_click_on_an_attention_weight(browser, watch):
     weights = weights_of(page).sum(2)
     for block, i in ((0, 0), (1, 9)):
         best = np.argsort(-weights[40, block], kind="stable")[:10] + 40 - page["attention"]["window"]
-        x, y, width, height = place(browser, weights_of_block(block), int(best[i]))
+        x, y, width, height = place(browser, weights_of_block(block), i)
         point(browser, x + width / 2, y + height / 2)
         check_shown(browser, videos, best[i])
         point(browser, 0, 0)
@@ -677,9 +677,9 @@ def test_axis_of_attention_is_that_of_the_step(browser, watch):
 @pytest.mark.parametrize(("step", "marks"), [(0, 0), (1, 1), (8, 2), (40, 10), (66, 16)])
 def test_highest_weights_are_marked(step, marks, browser, watch):
     watch(step)
-    script = "return [...document.querySelectorAll(arguments[0])].filter(bar => bar.style.fill === arguments[1]).length"
     for block in (0, 1):
-        assert browser.execute_script(script, f"{weights_of_block(block)} path", "rgb(200, 85, 61)") == marks
+        points = browser.find_elements("css selector", weights_of_block(block))
+        assert [point.value_of_css_property("fill") for point in points] == ["rgb(200, 85, 61)"] * marks
     assert browser.find_element("id", "top").text == "red: the highest quarter, at most 16"
 
 
