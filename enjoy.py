@@ -5,9 +5,11 @@
 
 The page is one file that needs no network: what the agent saw beside the ground truth (and beside what it reconstructed
 from memory, where it was trained to), its actions and their probabilities, its state values and its policy's entropy,
-the rewards, and the steps that every block of a Transformer-XL attended to (thesis 6.5). Needs the extra `eval`.
+the rewards, and the steps that every block of a Transformer-XL attended to (thesis 6.5), or the state of a recurrent
+memory. Two agents are shown side by side. Needs the extra `eval`.
 
-Shape letters: T steps of the episode, A action branches, K blocks, H heads, M earlier steps that a step attends to.
+Shape letters: T steps of the episode, A action branches, K blocks, H heads, M earlier steps that a step attends to,
+P vectors of a recurrent memory's state, D its units.
 """
 
 import base64
@@ -146,6 +148,7 @@ class Episode:
     truth: list[np.ndarray] = field(default_factory=list)  # T x (G,); empty where the environment tells none
     estimate: list[np.ndarray] = field(default_factory=list)  # T x (G,); empty without an estimator
     attention: list[list[np.ndarray]] = field(default_factory=list)  # T x K x (H, M or fewer), the oldest step first
+    states: list[np.ndarray] = field(default_factory=list)  # T x (P, D), each with the step's observation in it
     events: dict[str, list[int]] = field(default_factory=dict)  # the steps of each, by its name
     finished: bool = False  # not cut short
     stacked: bool = False  # its images are stacks of grayscale ones
@@ -174,8 +177,10 @@ def play(
     torch.manual_seed(seed)
     family = family_of(envs.spec.id)
     episode = Episode(stacked=stacked)
+    rewarded = family.rewarded if family else "reward"
+    episode.events = {rewarded: [], "negative reward": []}
     if family:
-        episode.events = {family.shown: [], family.rewarded: [], "failure": []}
+        episode.events |= {"failure": [], family.shown: []}
     obs, infos = envs.reset(seed=seed)
     memory = agent.memory.begin_rollout(agent.memory.initial(1, torch.device("cpu")), max_steps)
     while not episode.finished and len(episode.actions) < max_steps:
@@ -186,14 +191,16 @@ def play(
         step = len(episode.actions)
         if family and family.shows(envs.unwrapped.state):
             episode.events[family.shown].append(step)
-        with watching(agent, episode):
+        with watching(agent, memory, episode):
             now = as_tensors(obs, torch.device("cpu"))
             actions, *_ = agent.get_action_and_value(now, memory, deterministic)
         episode.actions.append(actions[0].tolist())
         obs, rewards, terminated, truncated, infos = envs.step(actions.numpy())
         episode.rewards.append(float(rewards[0]))
-        if family and (rewards[0] > 0 or terminated[0]):
-            episode.events[family.rewarded if rewards[0] > 0 else "failure"].append(step)
+        if rewards[0]:
+            episode.events[rewarded if rewards[0] > 0 else "negative reward"].append(step)
+        if family and terminated[0] and rewards[0] <= 0:
+            episode.events["failure"].append(step)
         episode.finished = bool(terminated[0] or truncated[0])
     if episode.finished:
         episode.final = {name: values.item() for name, values in final_numbers(infos, np.ones(1, bool)).items()}
@@ -201,8 +208,8 @@ def play(
 
 
 @contextlib.contextmanager
-def watching(agent: nn.Module, episode: Episode) -> Iterator[None]:
-    """Add to the episode what the agent's heads, and a transformer's attention, compute at each step of one lane."""
+def watching(agent: nn.Module, memory: Any, episode: Episode) -> Iterator[None]:
+    """Add to the episode what the agent's heads and its memory, attention or a state, compute at a step of one lane."""
 
     def add_outputs(_: nn.Module, given: Any, outputs: tuple) -> None:
         policy, values, features = outputs
@@ -226,8 +233,11 @@ def watching(agent: nn.Module, episode: Episode) -> Iterator[None]:
     finally:
         for hook in hooks:
             hook.remove()
+    hidden = getattr(memory, "hidden", None)
     if weights:
         episode.attention.append(weights)
+    elif isinstance(hidden, Tensor) and len(hidden) == 1 and hidden.numel():
+        episode.states.append(hidden[0].reshape(-1, hidden.shape[-1]).numpy().copy())
 
 
 def attention_weights(attention: nn.Module, x: Tensor, keys: Tensor, age: Tensor, mask: Tensor) -> Tensor:
@@ -277,7 +287,7 @@ def displayable(pixels: np.ndarray, stacked: bool) -> np.ndarray:
 # ---- PAGE ----
 def episode_data(episode: Episode, env_id: str, facts: dict[str, Any]) -> dict[str, Any]:
     """Return an episode as JSON can hold it; facts, by name, stand in the page's head."""
-    lines = {"state value": episode.values, "entropy": episode.entropies, "reward": episode.rewards}
+    lines = {"state value": episode.values, "entropy": episode.entropies}
     branches = zip(branch_names(env_id, episode.policy[0]).items(), zip(*episode.policy, strict=True), strict=True)
     family = family_of(env_id)
     return {
@@ -290,12 +300,14 @@ def episode_data(episode: Episode, env_id: str, facts: dict[str, Any]) -> dict[s
         ],
         "actions": episode.actions,
         "lines": {name: rounded(line) for name, line in lines.items()},
+        "rewards": rounded(episode.rewards),
         "events": episode.events,
         "truth_is": family.truth if family else "",
         "truth_names": family.numbers[: len(episode.truth[0])] if family else [],
         "truth": rounded(episode.truth),
         "estimate": rounded(episode.estimate),
         "attention": packed(episode.attention),
+        "state": packed_states(episode.states),
     }
 
 
@@ -340,6 +352,21 @@ def packed(attention: list[np.ndarray]) -> dict[str, Any] | None:
     return {"blocks": blocks, "heads": heads, "window": window, "weights": base64.b64encode(weights.tobytes()).decode()}
 
 
+def packed_states(states: list[np.ndarray]) -> dict[str, Any] | None:
+    """Pack the states of a memory as P x D x T bytes: -127 to 127, times a vector's largest number / 127, plus 128.
+
+    Units that change together are side by side: a vector's stand in the order of its first principal component.
+    """
+    if not states:
+        return None
+    units = np.stack(states, -1)  # (P, D, T)
+    components, *_ = np.linalg.svd(units - units.mean(2, keepdims=True), full_matrices=False)
+    units = np.take_along_axis(units, components[:, :, :1].argsort(1), 1)
+    largest = np.abs(units).max((1, 2)).clip(1e-3)  # (P,)
+    levels = (128 + 127 * units / largest[:, None, None]).round().astype(np.uint8)
+    return {"largest": rounded(largest), "units": units.shape[1], "levels": base64.b64encode(levels.tobytes()).decode()}
+
+
 def page(data: dict[str, Any], plotly: str) -> str:
     """Fill enjoy.html with the data and the source of the plotting library."""
     template = Path(__file__).with_name("enjoy.html").read_text(encoding="utf-8")
@@ -380,10 +407,11 @@ def main(config: Config) -> str:
     for level in range(seed, seed + config.levels):
         for path, (agent, envs, args) in players.items():
             episode = play(agent, envs, level, config.max_steps, config.deterministic, stacked=args.frame_stack > 0)
-            facts = {"agent": "/".join(Path(path).absolute().parts[-2:]), "memory": memory_of(args)}
-            facts |= {"actions": "most probable" if config.deterministic else "sampled", "seed": level}
-            episodes.append(episode_data(episode, env_id, facts | outcome(episode, env_id)))
-    data = {"title": env_id, "options": options, "episodes": episodes}
+            facts = {"agent": "/".join(Path(path).absolute().parts[-2:]), **outcome(episode, env_id)}
+            facts |= {"memory": memory_of(args), "seed": level}
+            facts["actions"] = "most probable" if config.deterministic else "sampled"
+            episodes.append(episode_data(episode, env_id, facts))
+    data = {"title": env_id, "options": options, "agents": len(players), "episodes": episodes}
     out = Path(config.out)
     out.write_text(page(data, get_plotlyjs()), encoding="utf-8")
     played = "; ".join("{steps} steps, return {return}".format(**episode["facts"]) for episode in episodes)
@@ -428,7 +456,7 @@ def memory_of(args: Any) -> str:
 def outcome(episode: Episode, env_id: str) -> dict[str, Any]:
     """Return what the page's head tells of the episode's end."""
     steps = len(episode.actions)
-    facts = {"steps": steps, "return": f"{sum(episode.rewards):.4g}"}
+    facts = {"return": f"{sum(episode.rewards):.4g}", "steps": steps}
     shares = {"agent_health"} | ({"carried_out", "coins_collected"} if "Endless" not in env_id else set())
     for name, value in episode.final.items():
         if name not in ("reward", "length"):

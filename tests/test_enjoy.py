@@ -96,6 +96,14 @@ def weights_of(page):
     return (packed.reshape(-1, attention["blocks"], attention["heads"], attention["window"]) / 255) ** 2
 
 
+def state_of(page):
+    """The memory's states (P, D, T) of an episode on the page."""
+    state = page["state"]
+    packed = np.frombuffer(base64.b64decode(state["levels"]), np.uint8).astype(float)
+    units = packed.reshape(len(state["largest"]), state["units"], -1)
+    return (units - 128) / 127 * np.array(state["largest"])[:, None, None]
+
+
 def picture(url):
     """The pixels (h, w, 3) of a data URL."""
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB"))
@@ -117,7 +125,7 @@ def test_every_kind_of_agent(name, saved):
     steps = page["steps"]
     assert line.startswith(f"page.html: {steps} steps, return {page['facts']['return']}, ")
     assert page["facts"]["memory"].split(",")[0] == ("GRU" if name == "CartPole" else name)
-    assert all(len(each) == steps for each in (page["actions"], *page["lines"].values()))
+    assert all(len(each) == steps for each in (page["actions"], page["rewards"], *page["lines"].values()))
     names = ["rendered frame" if name in ("GTrXL", "CartPole") else "agent's view"]
     names += ["ground truth"] * (name != "CartPole") + ["reconstruction"] * bool(args.reconstruction_coef)
     assert [video["name"] for video in page["videos"]] == names
@@ -125,6 +133,9 @@ def test_every_kind_of_agent(name, saved):
     assert len(page["truth"]) == steps * (name != "CartPole")
     assert len(page["estimate"]) == steps * bool(args.ground_truth_coef)
     assert (page["attention"] is not None) == (script is ppo_trxl)
+    assert (page["state"] is not None) == (name in ("GRU", "LSTM", "CartPole"))
+    if page["state"]:
+        assert state_of(page).shape == (1 + (name == "LSTM"), args.hidden_size, steps)
     for branch in page["branches"]:
         assert np.allclose(np.sum(branch["probabilities"], 1), 1, atol=1e-4)
         assert len(branch["actions"]) == len(branch["probabilities"][0])
@@ -234,11 +245,14 @@ def test_most_probable_actions(saved):
     agent, envs, _ = enjoy.load("model.pt")
     obs, _ = envs.reset(seed=3)
     memory = agent.memory.begin_rollout(agent.memory.initial(1, torch.device("cpu")), 40)
+    states = []
     for actions in page["actions"]:
         with torch.no_grad():
             taken, *_ = agent.get_action_and_value(as_tensors(obs, torch.device("cpu")), memory, True)
         assert taken.tolist() == [actions]
+        states.append(memory.hidden[0].numpy())
         obs, *_ = envs.step(np.array([actions]))
+    assert page["state"] == enjoy.packed_states(states)
     assert page["facts"]["actions"] == "most probable"
     assert page_of(max_steps=40)["episodes"][0]["actions"] != page["actions"]
 
@@ -341,9 +355,13 @@ def test_spotlights(saved):
         raise AssertionError("no episode was failed")
 
 
-def test_other_environments_have_no_events(saved):
+def test_rewards_of_other_environments(saved):
     saved(env_id="CartPole-v1")
-    assert played().events == {}
+    episode = played()
+    assert episode.events == {"reward": [*range(len(episode.actions))], "negative reward": []}
+    saved(env_id=register(lambda **more: gym.wrappers.TransformReward(gym.make("CartPole-v1", **more), float.__neg__)))
+    episode = played()
+    assert episode.events == {"reward": [], "negative reward": [*range(len(episode.actions))]}
 
 
 def test_the_ground_truth_of_other_environments(saved):
@@ -461,6 +479,16 @@ def test_attention_is_packed_by_age():
     assert enjoy.packed([]) is None
 
 
+def test_states_are_packed_with_similar_units_together():
+    wave = np.sin(np.arange(50))
+    units = np.stack([wave, -2 * wave, 0 * wave, 1.5 * wave])
+    state = state_of({"state": enjoy.packed_states([*np.stack([units, 3 * units]).transpose(2, 0, 1)])})
+    order = [1, 2, 0, 3] if np.allclose(state[0, 0], units[1], atol=0.01) else [3, 0, 2, 1]
+    assert np.allclose(state[0], units[order], atol=0.01)
+    assert np.allclose(np.sort(state[1], 0), np.sort(3 * state[0], 0), atol=0.04)
+    assert enjoy.packed_states([]) is None
+
+
 def test_small_weights_keep_their_digits():
     """Those of a uniform attention to 256 steps still add up to one."""
     weights = weights_of({"attention": enjoy.packed([np.full((1, 1, 256), 1 / 256)])})
@@ -522,7 +550,8 @@ def first_episode(path):
 
 @pytest.fixture
 def watch(browser, saved, tmp_path_factory):
-    """Show the page of a transformer's episode at a step, as loaded; return what it holds, and its videos' frames.
+    """Show the page at a step, a transformer's episode alone or, where loaded, beside a GRU's; return what it holds
+    of the first, and its videos' frames.
 
     In the end there is nothing in the browser's console, and the page has loaded nothing.
     """
@@ -535,14 +564,14 @@ def watch(browser, saved, tmp_path_factory):
             Path(agent).parent.mkdir()
             saved(ppo_trxl, agent, env_id="MortarMayhem-Grid-v0", trxl_memory_length=128, env_options=options)
             saved(path="other.pt", env_id="MortarMayhem-Grid-v0", env_options=options)
-            enjoy.main(enjoy.Config(agent, ("other.pt",), seed=3, out=str(path)))
+            enjoy.main(enjoy.Config(agent, ("other.pt",), seed=5, out=str(path)))
         if load or not browser.current_url.startswith(path.as_uri()):
             browser.get("about:blank")  # or the same page at another step would not be loaded anew
             browser.get(f"{path.as_uri()}#{step}")
             assert step_of(browser) == step
-        else:  # loading takes a second
-            browser.execute_script("find('#episode').value = 0; find('#view').selectedIndex = 0; newEpisode();")
-            browser.execute_script(f"go({step})")
+        if not load:  # which takes a second
+            browser.execute_script("find('#view').selectedIndex = 0; find('#first').value = 0;")
+            browser.execute_script(f"find('#second').value = 'alone'; newEpisodes(); go({step})")
         return first_episode(path)
 
     yield open_page
@@ -597,15 +626,15 @@ def press(browser, *keys):
 def test_click_on_a_line(browser, watch):
     page, videos = watch(5)
     check_step(browser, videos, 5)
-    for line, step in enumerate((31, 12, 40)):
+    for line, step in enumerate((31, 12)):
         x, y, width, height = place(browser, "#curves .scatterlayer .js-line", line)
         click(browser, x + width * step / (page["steps"] - 1), y + height / 2)
         check_step(browser, videos, step)
 
 
-def points_of_block(block):
-    """Where the marks of a block's highest weights are: the rows above it are three curves and the actions."""
-    return f"#curves .xy{5 + block} .points .point"
+def weights_of_block(block):
+    """The marks of a block's highest weights: the rows above it are two curves and the actions."""
+    return f"#curves .xy{4 + block} .points .point"
 
 
 def test_click_on_an_attention_weight(browser, watch):
@@ -613,7 +642,7 @@ def test_click_on_an_attention_weight(browser, watch):
     weights = weights_of(page).sum(2)
     for block, i in ((0, 0), (1, 9)):
         best = np.argsort(-weights[40, block], kind="stable")[:10] + 40 - page["attention"]["window"]
-        x, y, width, height = place(browser, points_of_block(block), i)
+        x, y, width, height = place(browser, weights_of_block(block), i)
         point(browser, x + width / 2, y + height / 2)
         check_shown(browser, videos, best[i])
         point(browser, 0, 0)
@@ -629,39 +658,37 @@ def choose(browser, name, value):
     Select(browser.find_element("id", name)).select_by_value(value)
 
 
-def trace(browser, expression):
-    """A part of a trace of the curves; the traces of attention are at firstBlock and after."""
-    return browser.execute_script(f"return find('#curves').data{expression}")
+def trace(browser, row, part, i=0):
+    """A part of the i-th trace in a row of the curves, counted from 1."""
+    script = "return find('#curves').data.filter(trace => trace.yaxis === arguments[0])[arguments[1]][arguments[2]]"
+    return browser.execute_script(script, f"y{row if row > 1 else ''}", i, part)
 
 
-def y_range(browser, row):
-    return browser.execute_script(f"return find('#curves').layout.yaxis{row}.range")
-
-
-def test_axis_of_attention_stays(browser, watch):
+def test_axis_of_attention_is_that_of_the_step(browser, watch):
     page, _ = watch(5)
-    largest = weights_of(page).sum(2)[min(16, page["steps"] // 4) :].max((0, 2))
-    assert largest[0] != pytest.approx(largest[1])
     for step in (5, 20, 40):
         browser.execute_script(f"go({step})")
         for block in (0, 1):
-            assert y_range(browser, 5 + block) == pytest.approx([0, 1.08 * largest[block]])
+            largest = weights_of(page)[step, block].sum(0).max()
+            axis = browser.execute_script(f"return find('#curves').layout.yaxis{4 + block}.range")
+            assert axis == pytest.approx([0, 1.08 * largest])
 
 
-@pytest.mark.parametrize(("step", "marks"), [(1, 1), (8, 2), (40, 10), (66, 16)])
+@pytest.mark.parametrize(("step", "marks"), [(0, 0), (1, 1), (8, 2), (40, 10), (66, 16)])
 def test_highest_weights_are_marked(step, marks, browser, watch):
     watch(step)
     for block in (0, 1):
-        assert len(browser.find_elements("css selector", points_of_block(block))) == marks
-    assert "highest quarter, at most 16" in browser.find_element("id", "top-only").text
+        points = browser.find_elements("css selector", weights_of_block(block))
+        assert [point.value_of_css_property("fill") for point in points] == ["rgb(200, 85, 61)"] * marks
+    assert browser.find_element("id", "top").text == "red: the highest quarter, at most 16"
 
 
 def test_one_head(browser, watch):
     page, _ = watch(40)
     weights = weights_of(page)[40, 1, :, -40:]
-    assert np.allclose(trace(browser, "[firstBlock + 2].y"), weights.sum(0))
+    assert np.allclose(trace(browser, 5, "y"), weights.sum(0))
     choose(browser, "head", "1")
-    assert np.allclose(trace(browser, "[firstBlock + 2].y"), weights[1])
+    assert np.allclose(trace(browser, 5, "y"), weights[1])
     names = [each.text for each in browser.find_elements("css selector", "#curves .annotation-text")]
     assert names[-2:] == ["attention of block 1, head 2", "attention of block 2, head 2"]
 
@@ -670,12 +697,13 @@ def test_heat_map(browser, watch):
     page, videos = watch(40)
     steps, weights = page["steps"], weights_of(page)[:, 0].sum(1)
     choose(browser, "view", "map")
-    shown = trace(browser, "[firstBlock].z")
+    shown = trace(browser, 4, "z")
     assert [[each is None for each in row] for row in shown] == [[s >= t for s in range(steps)] for t in range(steps)]
     for t in (1, 40, steps - 1):
         assert np.allclose(shown[t][:t], weights[t, -t:])
-    assert not browser.find_element("id", "top-only").is_displayed()
-    x, y, width, height = place(browser, "#curves .xy5 .hm image", 0)
+    assert not browser.find_element("id", "top").is_displayed()
+    assert len(browser.find_elements("css selector", "#curves .colorbar")) == 2  # one for each block
+    x, y, width, height = place(browser, "#curves .xy4 .hm image", 0)
     click(browser, x + width * 12.5 / steps, y + height / 2)
     check_step(browser, videos, 12)
 
@@ -683,33 +711,62 @@ def test_heat_map(browser, watch):
 def test_events_and_actions(browser, watch):
     page, _ = watch(5)
     shown = page["events"]["command shown"]
-    assert trace(browser, "[3].x") == shown
-    assert trace(browser, "[3].y") == [page["lines"]["state value"][step] for step in shown]
+    row = [event for event, steps in page["events"].items() if steps].index("command shown") + 1  # below the line
+    assert trace(browser, 1, "x", row) == shown
+    assert trace(browser, 1, "y", row) == [page["lines"]["state value"][step] for step in shown]
     (branch,) = page["branches"]
     taken = [branch["actions"][action] for (action,) in page["actions"]]
-    assert trace(browser, "[firstBlock - 1].text") == [taken]
-    assert trace(browser, "[firstBlock - 1].z") == [[action for (action,) in page["actions"]]]
+    assert trace(browser, 3, "text") == [taken]
+    assert trace(browser, 3, "z") == [[action for (action,) in page["actions"]]]
     legend = browser.find_element("id", "legend").text.split("\n")
-    assert legend[0] == "◆ command shown"
+    assert "◆ command shown" in legend
     assert legend[-4:] == ["■ none", "■ turn left", "■ turn right", "■ forward"]
 
 
-def test_another_episode(browser, watch, tmp_path_factory):
-    watch(20)
+def test_the_last_step_is_whole(browser, watch):
+    """An event there is not cut at its middle, even where the axis ends."""
+    page, _ = watch(5)
+    assert page["events"]["failure"] == [page["steps"] - 1]
+    browser.execute_script(f"Plotly.relayout('curves', {{'xaxis.range': [0, {page['steps'] - 1}]}})")
+    before = sum(len(page["events"][name]) for name in ("command completed", "negative reward"))
+    x, y, width, height = place(browser, "#curves .xy .point", before)
+    pixels = np.asarray(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("L")).astype(int)
+    left, top, right, bottom = map(round, (x, y, x + width, y + height))
+    mark = pixels[top:bottom, left:right] < 128
+    half = mark.shape[1] // 2
+    assert mark[:, -half:].sum() > mark[:, :half].sum() / 2 > 0
+
+
+def test_two_agents(browser, watch, tmp_path_factory):
+    """Both at the same step of the same level; who has ended stays at the end."""
+    watch(20, load=True)
     page = data_of((tmp_path_factory.getbasetemp() / "watched.html").read_text())
-    assert browser.find_element("id", "options").text == "command_count [16]"
-    other = page["episodes"][1]
-    choose(browser, "episode", "1")
-    check_step(browser, [frames_of(video) for video in other["videos"]], 20)
-    texts = [each.text for each in browser.find_elements("css selector", "#bars .bartext")]
-    assert texts == [f"{each:.2f}" for each in other["branches"][0]["probabilities"][20]]
-    facts = [each.text for each in browser.find_elements("css selector", "header span")]
-    assert facts == [f"{name} {value}" for name, value in other["facts"].items()]
+    assert browser.find_element("css selector", "header > span").text == "actions sampled, command_count [16]"
+    episodes = page["episodes"]
+    films = [[frames_of(video) for video in each["videos"]] for each in episodes]
+    check_step(browser, [*films[0], *films[1]], 20)
+    cards = browser.find_elements("class name", "agent")
+    for letter, card, each in zip("AB", cards, episodes, strict=True):
+        assert card.find_element("tag name", "h2").text == f"{letter} {each['facts']['agent']}"
+        assert card.find_element("class name", "facts").text.startswith(f"return {each['facts']['return']} steps ")
+        texts = [bar.text for bar in card.find_elements("css selector", ".bartext")]
+        assert texts == [f"{each:.2f}" for each in each["branches"][0]["probabilities"][20]]
+    for i, each in enumerate(episodes):
+        assert trace(browser, 1, "y", i) == each["lines"]["state value"]
+    assert np.allclose(trace(browser, 6, "z"), state_of(episodes[1])[0])  # below two blocks of attention
+    assert len(browser.find_elements("css selector", "#curves .colorbar")) == 1
+    steps = [each["steps"] for each in episodes]
+    press(browser, Keys.END)
+    assert step_of(browser) == max(steps) - 1
+    check_shown(browser, [[video[n - 1]] for film, n in zip(films, steps, strict=True) for video in film], 0)
+    ended = [n < max(steps) for n in steps]
+    assert ["ended" in card.get_attribute("class") for card in cards] == ended
+    choose(browser, "first", "1")
+    assert [each.text for each in browser.find_elements("css selector", ".agent h2")] == [episodes[1]["facts"]["agent"]]
     assert not browser.find_element("id", "attention").is_displayed()
-    press(browser, Keys.ARROW_RIGHT)  # of the video, not of the list
-    assert step_of(browser) == 21
-    choose(browser, "episode", "0")  # which has more axes
-    assert len(browser.find_elements("css selector", points_of_block(0))) == 6
+    step = step_of(browser)
+    press(browser, Keys.ARROW_LEFT)  # of the video, not of the list
+    assert step_of(browser) == step - 1
 
 
 def test_keys(browser, watch):
@@ -741,33 +798,42 @@ def test_keys(browser, watch):
 
 def test_bars_and_numbers_are_those_of_the_step(browser, watch):
     page, _ = watch(7)
-    texts = [each.text for each in browser.find_elements("css selector", "#bars .bartext")]
+    texts = [each.text for each in browser.find_elements("css selector", ".probabilities .bartext")]
     assert texts == [f"{each:.2f}" for each in page["branches"][0]["probabilities"][7]]
     colors = browser.execute_script(
-        "return [...document.querySelectorAll('#bars .point path')].map(bar => bar.style.fill)"
+        "return [...document.querySelectorAll('.probabilities .point path')].map(bar => bar.style.fill)"
     )
     red, blue = "rgb(200, 85, 61)", "rgb(185, 203, 220)"
     assert colors == [red if action == page["actions"][7][0] else blue for action in range(4)]
-    table = [row.text for row in browser.find_elements("css selector", "#truth tr")]
+    chosen = browser.find_element("css selector", ".policy span")
+    assert (chosen.text, chosen.value_of_css_property("color")) == ("■ chosen", "rgba(200, 85, 61, 1)")
+    table = [row.text for row in browser.find_elements("css selector", ".truth tr")]
     assert table == ["column row", " ".join(["true", *(f"{each:.3f}" for each in page["truth"][7])])]
 
 
-def test_numbers_as_names_of_actions(browser, saved, tmp_path):
+def test_other_environments_in_the_browser(browser, saved, tmp_path):
+    """Actions are numbers; the page opens at the middle one of the rewards, which are marks on the values."""
     saved(env_id="CartPole-v1")
-    page_of()
+    (page,) = page_of()["episodes"]
     browser.get((tmp_path / "page.html").as_uri())
-    assert [each.text for each in browser.find_elements("css selector", "#bars .xtick")] == ["0", "1"]
+    assert [each.text for each in browser.find_elements("css selector", ".probabilities .xtick")] == ["0", "1"]
+    assert step_of(browser) == (page["steps"] - 1) // 2
+    assert trace(browser, 1, "x", 1) == [*range(page["steps"])]
+    assert trace(browser, 1, "text", 1) == ["reward, reward 1"] * page["steps"]
 
 
-@pytest.mark.parametrize("width", [1920, 700, 400])
-def test_every_width(width, browser, watch):
-    """Nothing is wider than its card: if the window has this width, comes to have it, or the page becomes narrower."""
+@pytest.mark.parametrize(("width", "height"), [(1920, 1080), (1280, 800), (700, 900), (400, 900)])
+def test_every_width(width, height, browser, watch):
+    """Nothing is wider than its card: if the window has this width, comes to have it, or the page becomes narrower.
+
+    The whole page fits a wide window; in a narrow one, the videos stay while the curves are scrolled.
+    """
     wide = """const right = element => element.getBoundingClientRect().right;
         const parts = card => [...card.querySelectorAll(":scope *:not(svg *)")];
         const spills = card => parts(card).some(part => right(part) > right(card));
         return document.documentElement.scrollWidth > innerWidth ||
             [...document.querySelectorAll("section")].some(spills)"""
-    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+    size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
     try:
         for _ in range(2):
             watch(3, load=True)
@@ -776,12 +842,18 @@ def test_every_width(width, browser, watch):
         browser.execute_script(f"document.body.style.width = '{width - 50}px'")
         wait_until(browser, lambda _: not browser.execute_script(wide))
         browser.execute_script("document.body.style.width = ''")
-        left, plots = (place(browser, card, 0) for card in ("#left", "#plots"))
+        left, plots, footer = (place(browser, card, 0) for card in ("#left", "#plots", "footer"))
         if width > 900:
             assert left[2] > 0.3 * width
+            assert plots[1] + plots[3] < footer[1]
             assert left[3] > 0.6 * plots[3]
+            assert browser.execute_script("return document.documentElement.scrollHeight === innerHeight")
         else:
             assert left[2] == plots[2] > 0.85 * width
+        if width == 700:
+            assert place(browser, "#curves .xy", 0)[1] < footer[1]
+            browser.execute_script("scrollTo(0, 9999)")
+            assert place(browser, "canvas", 0)[1] >= 0
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
@@ -790,7 +862,8 @@ def test_dark_mode(browser, watch):
     """It begins when the system changes to it; all text and lines then have other colors than the background."""
     script = """const style = selector => getComputedStyle(document.querySelector(selector));
         return [style("body").backgroundColor, style("#plots").backgroundColor, style("h1").color,
-            style("#curves .xtick text").fill, style("#bars .ytick text").fill, style("#curves .js-line").stroke]"""
+            style("#curves .xtick text").fill, style(".probabilities .ytick text").fill,
+            style("#curves .js-line").stroke]"""
     watch(3)
     light = browser.execute_script(script)
     dark_mode = {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
