@@ -72,7 +72,7 @@ def test_a_table_leaves_out_agents_without_runs_and_compares_with_the_best():
 
 def test_an_overview_says_where_seeds_or_agents_are_missing():
     spotlights = run_with(0, 0, 0.25, metric="eval/success")
-    commands = run_with(0, 0, 2, metric="eval/commands_completed")
+    commands = run_with(0, 0, 2, metric="eval/carried_out")
     slow = copy.deepcopy(spotlights)
     slow.curves["charts/seconds_iteration"][1][:] = 180
     commands.args["total_timesteps"] = "8192040"
@@ -86,7 +86,7 @@ def test_an_overview_says_where_seeds_or_agents_are_missing():
         "| task, score | steps | random | GRU | LSTM | scripted | thesis: GRU, TrXL | minutes |",
         "|---|---:|---:|---:|---:|---:|---:|---:|",
         "| SearingSpotlights-v0, success | 0.0003 M | 0.01 | 0.25 ± 0.00 | 0.25, 1 seed | 0.90 |  | 3 to 9 |",
-        "| Endless-MortarMayhem-v0, commands_completed | 8.192 M |  | 2.00 ± 0.00, 2 seeds |  |  | 120, 18 | 3 |",
+        "| Endless-MortarMayhem-v0, carried_out | 8.192 M |  | 2.00 ± 0.00, 2 seeds |  |  | 120, 18 | 3 |",
     ]
 
 
