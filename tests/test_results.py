@@ -109,10 +109,11 @@ def test_the_page_ends_with_the_tables_of_the_results_that_are_there(capsys):
         assert len({tuple(plan.logged_args().items()) for plan in plans}) == len(plans), "no two are the same"
 
 
-def test_counts_of_levels(monkeypatch, capsys):
+def test_counts_of_levels(monkeypatch, capsys, tmp_path):
     """Of the first hundred: two commands on the grid have few different beginnings."""
     for name, value in {"LEVELS": 100, "TEST_LEVELS": 50}.items():
         monkeypatch.setattr(trained_paths, name, value)
+    monkeypatch.setattr(tables, "NEW_LEVELS", tmp_path / "new_levels.csv")
     monkeypatch.setattr(trained_paths, "COUNTED", {name: trained_paths.COUNTED[name] for name in ("quickstart",)})
     trained_paths.main(trained_paths.Config(count=True))
     args = ppo_gru.Args(env_options=ppo_gru.QUICKSTART["env_options"])

@@ -1,6 +1,7 @@
 """benchmarks/tables.py: what is said of agents by what they reached."""
 
 import copy
+import json
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,36 @@ def test_a_row_of_the_table():
     assert " | 4.00 | 2.0 |  | 3.0 |" in tables.row("GRU", runs, task, best=12.0)
     assert "| 8.00 | 8.00 | 8.00 |" in tables.row("LSTM", runs, task, best=12.0)
     assert "| 0.00 |  |  | 3.0 |" in tables.row("TrXL", runs, task, best=0.0)
+
+
+def test_test_levels_that_were_trained_on_do_not_score(monkeypatch):
+    task = TASKS["MysteryPath-Grid-v0"]
+    new = np.array([True, False, True, False])
+    monkeypatch.setattr(tables, "new_levels", lambda: {(task.env_id, "{}"): new})
+    scores = np.arange(4.0)[None, :, None]  # of each level, its number
+
+    def played(**changes):
+        args = {"env_id": task.env_id, "env_options": "{}", "start_level": "0", "num_levels": "100000"}
+        return [RunLog("", args | changes, {"test/success": ([300], scores), "eval/success": ([300], scores)})]
+
+    assert tables.final_scores("success", played())[0, :, 0].tolist() == [0, 2]
+    assert tables.final_scores("success", played(), every_level=True).shape == (1, 4, 1)
+    for others in ({"num_levels": "50000"}, {"start_level": "7"}, {"env_options": '{"show_goal": true}'}):
+        assert tables.final_scores("success", played(**others)).shape == (1, 4, 1), "not known"
+    new[:] = False
+    assert tables.final_scores("success", played()).shape == (1, 4, 1), "there are no others"
+
+
+def test_which_test_levels_are_new():
+    """As benchmarks/trained_paths.py --count prints it."""
+    new = {env_id: each.sum() for (env_id, options), each in tables.new_levels().items() if options == "{}"}
+    assert new == {
+        "MortarMayhem-Grid-v0": 998,
+        "MortarMayhemB-Grid-v0": 998,
+        "MysteryPath-v0": 133,
+        "MysteryPath-Grid-v0": 133,
+    }
+    assert not tables.new_levels()["MortarMayhem-Grid-v0", json.dumps(TASKS["mortar-mayhem"].options)].any()
 
 
 def test_scores_are_those_on_test_levels_where_all_runs_have_them():
