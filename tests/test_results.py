@@ -12,12 +12,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import tyro
+from matplotlib.axes import Axes
 from PIL import Image
 
 import claims
 import frontier
 import learning
 import ppo_gru
+import seeds
 import tables
 import trained_paths
 import tuning
@@ -63,6 +65,18 @@ def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_pa
     assert len(scores) > 10
     assert [score for score in scores if score not in printed] == []
     made, shown = (Image.open(each).size for each in (tmp_path / "paths.png", "docs/trained_paths.png"))
+    assert made == shown
+
+
+def test_every_seed_is_a_dot(monkeypatch, tmp_path):
+    dots = []
+    monkeypatch.setattr(Axes, "plot", lambda self, x, y, style, **_: dots.append((x, y)) if style == "o" else None)
+    seeds.main(tmp_path / "seeds.png")
+    drawn = [list(zip(x, y, strict=True)) for x, y in dots]
+    assert len(drawn) == 40
+    assert [len(each) for each in drawn].count(3) == 34, "of three tasks, some agents are not trained so long"
+    assert max(y for _, y in drawn[7]) == pytest.approx(1, abs=0.02), "TrXL+ in Mortar Mayhem Grid"
+    made, shown = (Image.open(folder / "seeds.png").size for folder in (tmp_path, ROOT / "docs"))
     assert made == shown
 
 
