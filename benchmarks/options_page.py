@@ -24,17 +24,16 @@ OPTIONS = f"""# Options and vectors
 
 `reset(options={{...}})` and `gym.make(id, options={{...}})` take these ([how long they hold](environments.md#options)).
 Columns with an id are its defaults: a dash where it does not have the option, "ignored" where the option has no effect,
-as in the original. Allowed values include both ends. `ints` is a list of 1 to {LONGEST_LIST} integers; one is sampled
-at every reset.
+as in the original. Allowed values include both ends. `ints` is a list of 1 to {LONGEST_LIST} integers, of which a reset
+samples one.
 """
 VECTORS = """## Vector observations
 
 With `obs_type="vector"`, observations are flat float32 vectors of what the image shows, and no image is drawn. Under
-the same options, two states with the same image have the same vector. What is not in sight is 0.
-
-A column with ids says where the entries are in their vector, counted from 0; its length is in brackets. Entries are
-from 0 to 1, unless a range stands beside them. Pixels count from the left and from the top of the 84 x 84 screen, x
-before y. The order of facings is up, up-left, left, and so on to up-right.
+the same options, two states with the same image have the same vector. What is not in sight is 0. A column with ids says
+where the entries are in their vector, counted from 0; its length is in brackets. Entries are from 0 to 1, unless a
+range stands beside them. Pixels count from the left and from the top of the 84 x 84 screen, x before y. The order of
+facings is up, up-left, left, and so on to up-right.
 
 - Where something hides a part of the agent, all facings that would look the same are 1, and the place is the middle of
   all places that would. Agents so large that they hide whole tiles hide their entries, too.
