@@ -9,7 +9,7 @@ The small suite has tasks that take minutes on a core, the full one the ten envi
 vector observations and small networks, and all see the same vectors, a frame stack the last few. Two sets of levels
 are outside of the training set. Evaluations during training (6.1.3) are on the development levels, which follow the
 training's: curves are made of them, settings and seeds chosen by them. At the end, the final weights play 1,000
-test levels once: that is their score.
+test levels once: that is their score, without the levels that begin as one of the training's.
 
 What a run reached is kept in a file of a few KB, in a folder of --results for its environment; `evaluate.py --curves`
 can draw these files too. A run whose file is there is not trained again; one that was stopped goes on from its last

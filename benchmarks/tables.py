@@ -4,7 +4,9 @@ Shape letters, R seeds, M levels, E episodes, P points of a curve, B resamples, 
 """
 
 import csv
+import functools
 import itertools
+import json
 import math
 import textwrap
 from dataclasses import dataclass
@@ -22,7 +24,7 @@ from ppo_utils.run_logs import RunLog, Runs, align
 from ppo_utils.scores import RESAMPLES, iqm
 from suites import COLORS, TASKS, Task
 
-BOUNDS, THESIS = (Path(__file__).with_name(name) for name in ("bounds.csv", "thesis.csv"))
+BOUNDS, THESIS, NEW_LEVELS = (Path(__file__).with_name(f"{name}.csv") for name in ("bounds", "thesis", "new_levels"))
 LEVEL = 0.05  # agents differ if the p-value is below that
 RIVALS = ("no memory", "GRU")  # with which the others are compared over all tasks
 NAMES_APART = 0.075  # between the names at the curves' ends, as a share of the axis
@@ -48,13 +50,27 @@ def read_thesis() -> dict[str, str]:
         return {row["task"]: f"{row['GRU']}, {row['TrXL']}" for row in csv.DictReader(file)}
 
 
-def final_scores(name: str, runs: list[RunLog]) -> np.ndarray:
+@functools.cache
+def new_levels() -> dict[tuple[str, str], np.ndarray]:
+    """Read what benchmarks/trained_paths.py wrote: for id and reset options, whether each test level (M,) is new."""
+    with NEW_LEVELS.open(newline="") as file:
+        rows = {row["task"]: np.array([*row["new"]]) == "1" for row in csv.DictReader(file)}
+    return {(TASKS[task].env_id, json.dumps(TASKS[task].options)): new for task, new in rows.items()}
+
+
+def final_scores(name: str, runs: list[RunLog], every_level: bool = False) -> np.ndarray:
     """Return the scores (R, M, E) of the seeds' final weights, by the name of a metric or score.
 
-    They are those on the test levels, or where a run has none, on the development levels.
+    They are those on the test levels, or where a run has none, on the development levels. Test levels that begin as one
+    of the training's are left out, unless `every_level` asks for them or there are no others.
     """
     levels = "test" if are_tested(name, runs) else "eval"
-    return align([run.curves[f"{levels}/{name}"] for run in runs])[1][-1]
+    scores = align([run.curves[f"{levels}/{name}"] for run in runs])[1][-1]
+    played = [runs[0].args.get(name) for name in ("env_id", "env_options", "start_level", "num_levels")]
+    new = new_levels().get((*played[:2],)) if played[2:] == ["0", "100000"] else None
+    if every_level or levels == "eval" or new is None or not new.any():
+        return scores
+    return scores[:, new]
 
 
 def are_tested(name: str, runs: list[RunLog]) -> bool:

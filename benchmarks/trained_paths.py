@@ -56,13 +56,20 @@ def times_trained_on(args: RunArgs, levels: int) -> np.ndarray:
 
 
 def print_counts() -> None:
-    """Print how many of each task's training levels differ, and how many test levels begin as none of them."""
+    """Print how many of each task's training levels differ, and how many test levels begin as none of them.
+
+    Which these are goes to benchmarks/new_levels.csv, a digit for each test level.
+    """
+    lines = ["task,new"]
     print("| task | different levels of the first 100,000 | new of 1,000 test levels |\n|---|---:|---:|")
     for name, (env_id, options) in COUNTED.items():
         args = ppo_gru.Args(env_id=env_id, env_options=options)
         trained_on = set(beginnings(args, 0, LEVELS))
-        new = sum(each not in trained_on for each in beginnings(args, learning.FIRST_TEST_LEVEL, TEST_LEVELS))
-        print(f"| {name} | {len(trained_on):,} | {new:,} |")
+        new = [each not in trained_on for each in beginnings(args, learning.FIRST_TEST_LEVEL, TEST_LEVELS)]
+        print(f"| {name} | {len(trained_on):,} | {sum(new):,} |")
+        if name in TASKS and not all(new):
+            lines.append(f"{name},{''.join(str(int(each)) for each in new)}")
+    tables.NEW_LEVELS.write_text("\n".join(lines) + "\n")
 
 
 def print_scores(out: Path) -> None:
@@ -78,12 +85,12 @@ def print_scores(out: Path) -> None:
     inside = [(low <= times) & (times < high) for low, high in pairwise(EDGES)]
     for axis, config, planned in zip(figure.subplots(1, 2, sharey=True), configs, plans, strict=True):
         (env_id,) = config.tasks
-        print(f"| {env_id}, path trained on | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}")
-        print(f"| test levels | {' | '.join(str(each.sum()) for each in inside)} |")
+        print(f"| {env_id}, path trained on | {' | '.join(columns)} | all |\n|---|{'---:|' * (len(columns) + 1)}")
+        print(f"| test levels | {' | '.join(str(each.sum()) for each in inside)} | {len(times):,} |")
         for agent, runs in learning.results_of(config, planned)[env_id].items():
-            scores = tables.final_scores("success", runs)  # (R, M, E)
+            scores = tables.final_scores("success", runs, every_level=True)  # (R, M, E)
             means = [scores[:, each].mean() for each in inside]
-            print(f"| {agent} | {' | '.join(f'{mean:.2f}' for mean in means)} |")
+            print(f"| {agent} | {' | '.join(f'{mean:.2f}' for mean in [*means, scores.mean()])} |")
             axis.plot(columns, means, marker="o", label=agent.removesuffix(", Muon, low rate"))
         axis.set_title(env_id)
         axis.set_xlabel("how often the level's path was trained on")

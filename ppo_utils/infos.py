@@ -15,7 +15,8 @@ from ppo_utils.flags import RunArgs
 from ppo_utils.lanes import OWN
 from ppo_utils.terminal import tell
 
-# Mortar Mayhem keeps these as the original has them: an agent that fails at the last command has 1 in both.
+# Mortar Mayhem keeps these as the original has them: an agent that fails at the last command has 1 in both. What counts
+# is `carried_out`.
 COUNT_A_FAILED_COMMAND = ("commands_completed", "success")
 
 

@@ -12,7 +12,7 @@ import os
 import shutil
 import tempfile
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -90,10 +90,14 @@ def read_run(path: str) -> RunLog:
 
 
 def with_carried_out(run: RunLog) -> RunLog:
-    """Return a run of finite Mortar Mayhem with the share of commands carried out, which earlier versions did not log.
+    """Return a run of Mortar Mayhem with the commands carried out, which earlier versions did not log.
 
-    The return tells it, which is 0.1 for each command unless reset options say otherwise.
+    In the endless task, they had the same number under another name. In the others, the return tells the share: it is
+    0.1 for each command unless reset options say otherwise.
     """
+    if run.args.get("env_id", "").startswith("Endless-MortarMayhem"):
+        curves = {name.replace("commands_completed", "carried_out"): each for name, each in run.curves.items()}
+        return replace(run, curves=curves)
     options = json.loads(run.args.get("env_options", "{}"))
     counts = options.get("command_count", [10])
     is_told = len(counts) == 1 and not any(name.startswith("reward_") for name in options)

@@ -15,7 +15,7 @@ import numpy as np
 # A family's own metric (6.1.3), by the beginning of the id; any other environment's is the return.
 OWN_METRIC = {
     "MortarMayhem": "carried_out",
-    "Endless-MortarMayhem": "commands_completed",
+    "Endless-MortarMayhem": "carried_out",
     "MysteryPath": "success",
     "SearingSpotlights": "success",
     "Endless-SearingSpotlights": "coins_collected",

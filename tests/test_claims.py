@@ -96,7 +96,7 @@ def test_holm_by_hand():
 def test_where_nobody_is_above_an_agent_without_memory_nothing_was_learned():
     def runs(*means):
         steps = np.array([100])
-        curves = [{"eval/commands_completed": (steps, np.full((1, 4, 1), mean))} for mean in means]
+        curves = [{"eval/carried_out": (steps, np.full((1, 4, 1), mean))} for mean in means]
         return [RunLog("", {}, each) for each in curves]
 
     claim = claims.CLAIMS["score-endless-mortar-mayhem"]
@@ -132,8 +132,8 @@ def test_a_task_of_which_little_was_learned(name, least):
 def test_runs_with_test_levels_are_compared_with_runs_without():
     """On the development levels, which all have."""
     steps = np.array([100])
-    curves = {"eval/commands_completed": (steps, np.full((1, 4, 1), 2.0))}
-    more = curves | {"test/commands_completed": (steps, np.full((1, 9, 1), 7.0))}
+    curves = {"eval/carried_out": (steps, np.full((1, 4, 1), 2.0))}
+    more = curves | {"test/carried_out": (steps, np.full((1, 9, 1), 7.0))}
     old, new = ([RunLog("", {}, each)] * 2 for each in (curves, more))
     claim = claims.CLAIMS["score-endless-mortar-mayhem"]
     assert claims.judge(claim, {"GRU": new, "TrXL": old}, []).text == "not decided"
@@ -214,7 +214,7 @@ def test_what_is_learned_is_judged_by_all_runs_without_memory(monkeypatch, capsy
         mean = 1.0 + 0.1 * plan.seed + (plan.agent == "no memory")
         curve = np.array([100]), np.full((1, 4, 1), mean)
         there = plan.agent != "no memory" or plan.seed in seeds
-        return RunLog("", plan.logged_args(), {"eval/commands_completed": curve}) if there else None
+        return RunLog("", plan.logged_args(), {"eval/carried_out": curve}) if there else None
 
     monkeypatch.setattr(learning, "result_of", result_of)
     claims.main(claims.Config(claims=("score-endless-mortar-mayhem",), report=True))

@@ -274,7 +274,7 @@ def test_options_go_over_those_of_the_training(saved):
     ("env_id", "name", "value", "shown"),
     [
         ("MortarMayhem-Grid-v0", "carried_out", 1.0, "100 %"),
-        ("Endless-MortarMayhem-v0", "commands_completed", 1.0, "1"),
+        ("Endless-MortarMayhem-v0", "carried_out", 1.0, "1"),
         ("SearingSpotlights-v0", "coins_collected", 0.5, "50 %"),
         ("Endless-SearingSpotlights-v0", "coins_collected", 2.0, "2"),
         ("Endless-SearingSpotlights-v0", "agent_health", 0.25, "25 %"),
@@ -328,7 +328,7 @@ def test_what_sets_agents_apart(tiny):
 def test_commands_and_failures():
     agent, envs, _ = enjoy.load(Path(__file__).parents[1] / "agents/endless-mortar-mayhem-gru.pt")
     episode = enjoy.play(agent, envs, 100_000, 500)
-    assert len(episode.events["command completed"]) == episode.final["commands_completed"] > 3
+    assert len(episode.events["command completed"]) == episode.final["carried_out"] > 3
     # A sequence also grows by a last command that failed, which ends the episode before the next is shown.
     assert len(episode.events["command shown"]) - episode.final["max_command_sequence"] in (0, 1)
     assert episode.events["failure"] == [len(episode.actions) - 1]

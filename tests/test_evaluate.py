@@ -423,6 +423,17 @@ def test_what_an_older_run_of_mortar_mayhem_carried_out():
         assert "eval/carried_out" not in older(unknown)
 
 
+def test_an_older_run_of_endless_mortar_mayhem_has_the_same_number_under_another_name():
+    with SummaryWriter("older") as writer:
+        writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|3|\n|env_id|Endless-MortarMayhem-v0|")
+        for name in ("eval/commands_completed", "episode/commands_completed", "eval/return"):
+            writer.add_scalar(name, 7.0, 10)
+    found = read_run("older").curves
+    assert {*found} >= {"eval/carried_out", "episode/carried_out", "eval/return"}
+    assert found["eval/carried_out"][1].item() == 7.0
+    assert not [name for name in found if "commands_completed" in name]
+
+
 def test_a_picture_goes_to_a_folder_that_is_not_there_yet():
     with SummaryWriter("run-1") as writer:
         writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|1|\n|env_id|A-v0|\n|exp_name|$_$^|")

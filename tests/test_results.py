@@ -12,12 +12,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import tyro
+from matplotlib.axes import Axes
 from PIL import Image
 
 import claims
 import frontier
 import learning
 import ppo_gru
+import seeds
 import tables
 import trained_paths
 import tuning
@@ -66,6 +68,18 @@ def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_pa
     assert made == shown
 
 
+def test_every_seed_is_a_dot(monkeypatch, tmp_path):
+    dots = []
+    monkeypatch.setattr(Axes, "plot", lambda self, x, y, style, **_: dots.append((x, y)) if style == "o" else None)
+    seeds.main(tmp_path / "seeds.png")
+    drawn = [list(zip(x, y, strict=True)) for x, y in dots]
+    assert len(drawn) == 40
+    assert [len(each) for each in drawn].count(3) == 34, "of three tasks, some agents are not trained so long"
+    assert max(y for _, y in drawn[7]) == pytest.approx(1, abs=0.02), "TrXL+ in Mortar Mayhem Grid"
+    made, shown = (Image.open(folder / "seeds.png").size for folder in (tmp_path, ROOT / "docs"))
+    assert made == shown
+
+
 def test_how_often_a_test_level_s_path_was_trained_on(tiny):
     """In both tasks, which have the same paths."""
     envs = gym.make_vec("MysteryPath-Grid-v0", num_envs=1000)
@@ -109,10 +123,11 @@ def test_the_page_has_the_table_of_the_results_that_are_there(capsys):
         assert len({tuple(plan.logged_args().items()) for plan in plans}) == len(plans), "no two are the same"
 
 
-def test_counts_of_levels(monkeypatch, capsys):
+def test_counts_of_levels(monkeypatch, capsys, tmp_path):
     """Of the first hundred: two commands on the grid have few different beginnings."""
     for name, value in {"LEVELS": 100, "TEST_LEVELS": 50}.items():
         monkeypatch.setattr(trained_paths, name, value)
+    monkeypatch.setattr(tables, "NEW_LEVELS", tmp_path / "new_levels.csv")
     monkeypatch.setattr(trained_paths, "COUNTED", {name: trained_paths.COUNTED[name] for name in ("quickstart",)})
     trained_paths.main(trained_paths.Config(count=True))
     args = ppo_gru.Args(env_options=ppo_gru.QUICKSTART["env_options"])

@@ -1,6 +1,7 @@
 """benchmarks/tables.py: what is said of agents by what they reached."""
 
 import copy
+import json
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,36 @@ def test_a_row_of_the_table():
     assert " | 4.00 | 2.0 |  | 3.0 |" in tables.row("GRU", runs, task, best=12.0)
     assert "| 8.00 | 8.00 | 8.00 |" in tables.row("LSTM", runs, task, best=12.0)
     assert "| 0.00 |  |  | 3.0 |" in tables.row("TrXL", runs, task, best=0.0)
+
+
+def test_test_levels_that_were_trained_on_do_not_score(monkeypatch):
+    task = TASKS["MysteryPath-Grid-v0"]
+    new = np.array([True, False, True, False])
+    monkeypatch.setattr(tables, "new_levels", lambda: {(task.env_id, "{}"): new})
+    scores = np.arange(4.0)[None, :, None]  # of each level, its number
+
+    def played(**changes):
+        args = {"env_id": task.env_id, "env_options": "{}", "start_level": "0", "num_levels": "100000"}
+        return [RunLog("", args | changes, {"test/success": ([300], scores), "eval/success": ([300], scores)})]
+
+    assert tables.final_scores("success", played())[0, :, 0].tolist() == [0, 2]
+    assert tables.final_scores("success", played(), every_level=True).shape == (1, 4, 1)
+    for others in ({"num_levels": "50000"}, {"start_level": "7"}, {"env_options": '{"show_goal": true}'}):
+        assert tables.final_scores("success", played(**others)).shape == (1, 4, 1), "not known"
+    new[:] = False
+    assert tables.final_scores("success", played()).shape == (1, 4, 1), "there are no others"
+
+
+def test_which_test_levels_are_new():
+    """As benchmarks/trained_paths.py --count prints it."""
+    new = {env_id: each.sum() for (env_id, options), each in tables.new_levels().items() if options == "{}"}
+    assert new == {
+        "MortarMayhem-Grid-v0": 998,
+        "MortarMayhemB-Grid-v0": 998,
+        "MysteryPath-v0": 133,
+        "MysteryPath-Grid-v0": 133,
+    }
+    assert not tables.new_levels()["MortarMayhem-Grid-v0", json.dumps(TASKS["mortar-mayhem"].options)].any()
 
 
 def test_scores_are_those_on_test_levels_where_all_runs_have_them():
@@ -72,7 +103,7 @@ def test_a_table_leaves_out_agents_without_runs_and_compares_with_the_best():
 
 def test_an_overview_says_where_seeds_or_agents_are_missing():
     spotlights = run_with(0, 0, 0.25, metric="eval/success")
-    commands = run_with(0, 0, 2, metric="eval/commands_completed")
+    commands = run_with(0, 0, 2, metric="eval/carried_out")
     slow = copy.deepcopy(spotlights)
     slow.curves["charts/seconds_iteration"][1][:] = 180
     commands.args["total_timesteps"] = "8192040"
@@ -86,7 +117,7 @@ def test_an_overview_says_where_seeds_or_agents_are_missing():
         "| task, score | steps | random | GRU | LSTM | scripted | thesis: GRU, TrXL | minutes |",
         "|---|---:|---:|---:|---:|---:|---:|---:|",
         "| SearingSpotlights-v0, success | 0.0003 M | 0.01 | 0.25 ± 0.00 | 0.25, 1 seed | 0.90 |  | 3 to 9 |",
-        "| Endless-MortarMayhem-v0, commands_completed | 8.192 M |  | 2.00 ± 0.00, 2 seeds |  |  | 120, 18 | 3 |",
+        "| Endless-MortarMayhem-v0, carried_out | 8.192 M |  | 2.00 ± 0.00, 2 seeds |  |  | 120, 18 | 3 |",
     ]
 
 

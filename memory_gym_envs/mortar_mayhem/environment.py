@@ -70,9 +70,9 @@ class MortarMayhem(WalkingVectorEnv):
 
     `ground_truth` (2,): the target tile's column and row, divided by arena size - 1. At an episode's end also `reward`,
     `length`, `commands_completed` and `success` (in the endless id `max_command_sequence`, the length of the longest
-    completed sequence). commands_completed is a share of the sequence, in the endless id a number of commands. The
-    finite ids add `carried_out`, the share of commands whose tile the agent was on when all others caught fire, which a
-    failed last command does not raise, and `is_success`, whether that is all of them.
+    completed sequence). Not in the original: `carried_out`, how many commands' tiles the agent was on when all
+    others caught fire, which a failed last command does not raise, and in the finite ids `is_success`, whether that is
+    all of them. In the finite ids, commands_completed and carried_out are shares of the sequence.
 
     ## Version History
 
@@ -209,7 +209,9 @@ class MortarMayhem(WalkingVectorEnv):
         """The lanes' ended episodes in numbers, each (n,)."""
         s, numbers = self.state, super().summary(lanes)
         if self.variant.endless:
-            return numbers | {"commands_completed": s.completed[lanes], "max_command_sequence": s.count[lanes] - 1}
+            completed = s.completed[lanes]  # a failure does not raise it, unlike the share below
+            numbers |= {"carried_out": completed, "commands_completed": completed}
+            return numbers | {"max_command_sequence": s.count[lanes] - 1}
         success = s.current[lanes] >= s.count[lanes]
         failed = s.burning[lanes] & ~rules.on_target(s, lanes) & ~success
         share = (s.current[lanes] - failed) / s.count[lanes]
