@@ -5,13 +5,13 @@
 
 Tasks, runs and results are those of benchmarks/learning.py: small networks, vector observations, minutes of training.
 
-A claim compares pairs of agents: each that is said to have the higher number with each that is said to have the lower
-one. A pair is decided as in the tables of results (`tables.Comparison`): by Welch's t-test over seeds and levels. The
-claim holds if all of its pairs are decided its way, does not hold if one is decided the other way, and else is not
-decided. Where the thesis says that agents are no better than others, that is contradicted if a pair is decided. Where
-no agent of a row scores higher than those without memory, or all have less than a quarter of what is possible (in
-endless tasks, of what the thesis' transformer has; nine tenths where falls are counted), the task has not been
-learned, and there is no verdict.
+A claim compares pairs of agents: each that is said to have the higher number (A in the table) with each that is said to
+have the lower one (B). A pair is decided as in the tables of results (`tables.Comparison`): by Welch's t-test over
+seeds and levels. The claim holds if all of its pairs are decided its way, does not hold if one is decided the other
+way, and else is not decided. Where the thesis says that agents are no better than others, that is contradicted if a
+pair is decided. Where no agent of a row scores higher than those without memory, or all have less than a quarter of
+what is possible (in endless tasks, of what the thesis' transformer has; nine tenths where falls are counted), the task
+has not been learned, and there is no verdict.
 
 With so many rows, some verdicts come by chance. A star marks those that also stand at a family-wise error of 5 % (Holm,
 1979). A row of several pairs has the largest of their p-values where all of them are needed, else the smallest times
@@ -21,6 +21,7 @@ With --report nothing is trained, and a claim is not tested if runs are missing.
 """
 
 import itertools
+import re
 import signal
 import sys
 from collections import Counter
@@ -91,7 +92,6 @@ class Claim:
     higher: tuple[str, ...]
     lower: tuple[str, ...]
     measure: Callable[[Task, list[RunLog]], np.ndarray] = score
-    text: str = ""  # where neither the claim's name nor its table's title says it
     flags: str = ""  # of all agents
     expects_difference: bool = True
 
@@ -113,17 +113,12 @@ class Claim:
 
 
 @dataclass(frozen=True)
-class Table:
-    """Claims that compare the same agents."""
+class Statement:
+    """What the thesis says, and the claims that it makes about tasks here."""
 
-    title: str
-    columns: tuple[str, ...]  # agents; others go to a last column of variants
+    text: str  # with its section
+    thesis: str  # its figures, as far as its text has them
     claims: dict[str, Claim]
-
-    @property
-    def has_variants(self) -> bool:
-        """Return whether claims compare agents without a column of their own."""
-        return any(agent not in self.columns for claim in self.claims.values() for agent in claim.agents)
 
 
 def claims_of(prefix: str, tasks: str, higher: tuple[str, ...], lower: tuple[str, ...], **others) -> dict[str, Claim]:
@@ -141,96 +136,184 @@ NO_MEMORY = (*FEW_FRAMES, "stack of 16")
 GRU, TRXL, LSTM, GTRXL = ("GRU",), ("TrXL",), ("LSTM",), ("GTrXL",)
 QUERY_POSITION, NORMALIZED = "TrXL --trxl-query-position", "GRU --norm-adv minibatch"
 MORTAR_MAYHEMS = "mortar-mayhem MortarMayhem-Grid-v0 MortarMayhem-v0"
-TABLES = (
-    Table(
-        "Agents with a memory are ahead of all others (6.2.1)",
-        ("no memory", "stack of 4", "stack of 16", "step encoding", "GRU", "TrXL"),
-        {
-            **claims_of("memory", f"{MORTAR_MAYHEMS} mystery-path MysteryPath-Grid-v0", MEMORY, NO_MEMORY),
-            **claims_of("memory", "MysteryPath-v0 SearingSpotlights-v0 commands-in-view", MEMORY, NO_MEMORY),
-            **claims_of("frames", "commands-in-view", ("step encoding", "stack of 4", "stack of 16"), ("no memory",)),
-            **claims_of("stack", "goal-in-view", ("stack of 16", *MEMORY), FEW_FRAMES),
-        },
+STATEMENTS = (
+    Statement(
+        "6.2.1 Mortar Mayhem needs memory",
+        "",
+        claims_of("memory", MORTAR_MAYHEMS, MEMORY, NO_MEMORY),
     ),
-    Table(
-        "GRU and TrXL: samples (6.2.2), endless tasks (6.3), falls (6.5.2)",
-        ("GRU", "TrXL"),
+    Statement(
+        "6.2.1 Mystery Path needs memory",
+        "",
+        claims_of("memory", "mystery-path MysteryPath-Grid-v0 MysteryPath-v0", MEMORY, NO_MEMORY),
+    ),
+    Statement(
+        "6.2.1 Searing Spotlights needs memory",
+        "no success without",
+        claims_of("memory", "SearingSpotlights-v0", MEMORY, NO_MEMORY),
+    ),
+    Statement(
+        "6.2.1 Memory is best in the act task",
+        "10 commands; step encoding 9.5, 16 frames 8, 4 frames 5",
+        claims_of("memory", "commands-in-view", MEMORY, NO_MEMORY),
+    ),
+    Statement(
+        "6.2.1 Frames or the step help in the act task",
+        "no memory is ineffective",
+        claims_of("frames", "commands-in-view", ("step encoding", "stack of 4", "stack of 16"), ("no memory",)),
+    ),
+    Statement(
+        "6.2.1 With its ends shown, 16 frames are enough in Mystery Path",
+        "4 frames, step encoding 0.40, no memory 0.11",
+        claims_of("stack", "goal-in-view", ("stack of 16", *MEMORY), FEW_FRAMES),
+    ),
+    Statement(
+        "6.2.2 TrXL needs fewer samples than GRU in Mortar Mayhem Grid",
+        "",
         {
             **claims_of("samples", "mortar-mayhem MortarMayhem-Grid-v0", TRXL, GRU, measure=area),
             "samples-small-values": Claim("mortar-mayhem", TRXL, GRU, area, flags="--value-init-gain 0.01"),
-            **claims_of("score", "MortarMayhem-v0", TRXL, GRU),
-            **claims_of("samples", "mystery-path MysteryPath-v0", TRXL, GRU, measure=area),
-            **claims_of("samples", "SearingSpotlights-v0 commands-in-view goal-in-view", GRU, TRXL, measure=area),
-            **claims_of("score", "endless-mortar-mayhem Endless-MortarMayhem-v0", GRU, TRXL),
-            **claims_of("score", "Endless-MysteryPath-v0 Endless-SearingSpotlights-v0", GRU, TRXL),
-            **claims_of("falls", "mystery-path MysteryPath-v0", GRU, TRXL, measure=falls),
         },
     ),
-    Table(
-        "LSTM is behind GRU (6.2.3)",
-        ("GRU", "LSTM"),
-        {
-            **claims_of("lstm-score", MORTAR_MAYHEMS, GRU, LSTM),
-            **claims_of("lstm-samples", "mystery-path MysteryPath-v0 SearingSpotlights-v0", GRU, LSTM, measure=area),
-        },
+    Statement(
+        "6.2.2 TrXL carries out more in Mortar Mayhem",
+        "GRU 6 commands, TrXL more",
+        claims_of("score", "MortarMayhem-v0", TRXL, GRU),
     ),
-    Table(
-        "GTrXL is behind TrXL (6.2.3)",
-        ("TrXL", "GTrXL"),
-        {
-            **claims_of("gates-score", MORTAR_MAYHEMS, TRXL, GTRXL),
-            **claims_of("gates-samples", "mystery-path MysteryPath-v0 SearingSpotlights-v0", TRXL, GTRXL, measure=area),
-        },
+    Statement(
+        "6.2.2 TrXL needs fewer samples in Mystery Path",
+        "",
+        claims_of("samples", "mystery-path MysteryPath-v0", TRXL, GRU, measure=area),
     ),
-    Table(
-        "Variants of the transformers, in the small Endless Mortar Mayhem",
-        ("GRU", "TrXL"),
+    Statement(
+        "6.2.2 GRU needs fewer in Searing Spotlights, the act task, Mystery Path with ends shown",
+        "",
+        claims_of("samples", "SearingSpotlights-v0 commands-in-view goal-in-view", GRU, TRXL, measure=area),
+    ),
+    Statement(
+        "6.2.3 LSTM is behind GRU in Mortar Mayhem",
+        "LSTM 3 commands",
+        claims_of("lstm-score", MORTAR_MAYHEMS, GRU, LSTM),
+    ),
+    Statement(
+        "6.2.3 LSTM needs more samples than GRU elsewhere",
+        "full success in Mystery Path",
+        claims_of("lstm-samples", "mystery-path MysteryPath-v0 SearingSpotlights-v0", GRU, LSTM, measure=area),
+    ),
+    Statement(
+        "6.2.3 GTrXL is behind TrXL in Mortar Mayhem",
+        "GTrXL 2 commands",
+        claims_of("gates-score", MORTAR_MAYHEMS, TRXL, GTRXL),
+    ),
+    Statement(
+        "6.2.3 GTrXL needs more samples than TrXL elsewhere",
+        "",
+        claims_of("gates-samples", "mystery-path MysteryPath-v0 SearingSpotlights-v0", TRXL, GTRXL, measure=area),
+    ),
+    Statement(
+        "6.2.3 In Mystery Path, gate bias 0 is better than 2",
+        "0.94, 0.81",
+        {"gate-bias": Claim("mystery-path", GTRXL, ("GTrXL --trxl-gate-bias 2",))},
+    ),
+    Statement(
+        "6.3 GRU is ahead of TrXL in Endless Mortar Mayhem",
+        "120, 18 commands",
+        claims_of("score", "endless-mortar-mayhem Endless-MortarMayhem-v0", GRU, TRXL),
+    ),
+    Statement(
+        "6.3 GRU is ahead in Endless Mystery Path",
+        "return 2.65, 2.02",
+        claims_of("score", "Endless-MysteryPath-v0", GRU, TRXL),
+    ),
+    Statement(
+        "6.3 GRU is ahead in Endless Searing Spotlights",
+        "about 20, 6 coins",
+        claims_of("score", "Endless-SearingSpotlights-v0", GRU, TRXL),
+    ),
+    Statement(
+        "6.5.2 GRU falls off more often in Mystery Path",
+        "5.65, 4.87 times",
+        claims_of("falls", "mystery-path MysteryPath-v0", GRU, TRXL, measure=falls),
+    ),
+    Statement(
+        "7.1.1 A larger TrXL stays behind GRU",
+        "",
         {
-            "gate-bias": Claim(
-                "mystery-path", GTRXL, ("GTrXL --trxl-gate-bias 2",), text="(6.2.3) in Mystery Path, 0 is better than 2"
-            ),
-            "endless-long": Claim("endless-long", GRU, (QUERY_POSITION,), text="(6.3, 7.1.3) 12 million steps"),
             "capacity": in_endless(
-                GRU,
-                ("TrXL --trxl-dim 96", "TrXL --trxl-num-layers 3", "TrXL --trxl-memory-length 256"),
-                text="(7.1.1) still behind GRU",
-            ),
-            "ground-truth": in_endless(("TrXL --ground-truth-coef 0.1",), TRXL, text="(7.1.2) estimating it helps"),
-            # The thesis' rate is at its final value after a fifth of the training.
-            "learning-rate": in_endless(
-                TRXL,
-                ("TrXL --final-lr 1e-5",),
-                text="(7.1.2) a higher final one helps",
-                flags="--anneal-steps 200000",
-            ),
-            "query-position": in_endless((QUERY_POSITION,), TRXL, text="(7.1.3) helps a little"),
-            "query-position-gru": in_endless(
-                GRU, (QUERY_POSITION, f"{QUERY_POSITION} --trxl-dim 96"), text="(7.1.3) still behind GRU"
-            ),
-            "stale": in_endless(("TrXL, refreshed",), TRXL, text="(7.1.4) refreshed memory helps"),
+                GRU, ("TrXL --trxl-dim 96", "TrXL --trxl-num-layers 3", "TrXL --trxl-memory-length 256")
+            )
+        },
+    ),
+    Statement(
+        "7.1.2 Estimating the ground truth helps TrXL",
+        "50, 18 commands",
+        {"ground-truth": in_endless(("TrXL --ground-truth-coef 0.1",), TRXL)},
+    ),
+    Statement(
+        "7.1.2 A higher final learning rate helps TrXL",
+        "24, 18",
+        # The thesis' rate is at its final value after a fifth of the training.
+        {"learning-rate": in_endless(TRXL, ("TrXL --final-lr 1e-5",), flags="--anneal-steps 200000")},
+    ),
+    Statement(
+        "7.1.3 The step in the query helps TrXL a little",
+        "19, 18",
+        {"query-position": in_endless((QUERY_POSITION,), TRXL)},
+    ),
+    Statement(
+        "7.1.3 GRU stays ahead of TrXL with that step",
+        "140 at its peak, 19",
+        {
+            "query-position-gru": in_endless(GRU, (QUERY_POSITION, f"{QUERY_POSITION} --trxl-dim 96")),
+            "endless-long": Claim("endless-long", GRU, (QUERY_POSITION,)),
+        },
+    ),
+    Statement(
+        "7.1.4 Refreshed memory may help TrXL",
+        "not tested",
+        {"stale": in_endless(("TrXL, refreshed",), TRXL)},
+    ),
+    Statement(
+        "7.1.5 Learned or relative positions are no better than absolute ones",
+        "",
+        {
             "encodings": in_endless(
                 tuple(f"TrXL --trxl-positional-encoding {kind}" for kind in ("learned", "relative")),
                 TRXL,
-                text="(7.1.5) no better than absolute",
                 expects_difference=False,
-            ),
+            )
         },
     ),
-    Table(
-        "Normalized advantages make GRU worse (7.2)",
-        ("GRU", NORMALIZED, "no memory --norm-adv minibatch"),
+    # Large steps are what the thesis suspects, and --target-kl would prevent them.
+    Statement(
+        "7.2 Normalized advantages make GRU worse in Searing Spotlights, all visible",
+        "1.00, 0.43",
+        claims_of("normalized", "all-in-view", GRU, (NORMALIZED,), flags="--target-kl None"),
+    ),
+    Statement(
+        "7.2 With normalized advantages, no memory is ahead of GRU",
+        "0.96, 0.43",
         {
-            **claims_of("normalized", "mortar-mayhem mystery-path", GRU, (NORMALIZED,)),
-            # Large steps are what the thesis suspects, and --target-kl would prevent them.
-            **claims_of("normalized", "all-in-view", GRU, (NORMALIZED,), flags="--target-kl None"),
             "normalized-no-memory": Claim(
                 "all-in-view", ("no memory --norm-adv minibatch",), (NORMALIZED,), flags="--target-kl None"
-            ),
-            "normalized-gradients": Claim("all-in-view", (NORMALIZED,), GRU, gradient_norm, flags="--target-kl None"),
+            )
         },
     ),
+    Statement(
+        "7.2 Normalized advantages make gradients larger",
+        "over 12 times",
+        {"normalized-gradients": Claim("all-in-view", (NORMALIZED,), GRU, gradient_norm, flags="--target-kl None")},
+    ),
+    Statement(
+        "7.2 Normalized advantages make GRU worse in Mortar Mayhem, Mystery Path",
+        "",
+        claims_of("normalized", "mortar-mayhem mystery-path", GRU, (NORMALIZED,)),
+    ),
 )
-CLAIMS = {name: claim for table in TABLES for name, claim in table.claims.items()}
+CLAIMS = {name: claim for statement in STATEMENTS for name, claim in statement.claims.items()}
+HEADING = """
+| statement | thesis | A | B | M steps | verdict | `--claims` |
+|---|---|---|---|---:|---|---|"""
 
 
 @dataclass
@@ -238,7 +321,7 @@ class Config(learning.Training):
     """Which claims to test."""
 
     claims: tuple[str, ...] = tuple(CLAIMS)
-    """names in the first column of docs/claims.md"""
+    """names in the last column of the table of docs/thesis.md"""
 
 
 @dataclass(frozen=True)
@@ -298,36 +381,25 @@ def holm(p_values: list[float]) -> list[bool]:
 
 
 def short(agent: str) -> str:
-    """Return an agent's name for the tables: without TrXL, of which most are variants."""
-    return suites.short(agent).removeprefix("TrXL, ")
-
-
-def heading(table: Table) -> str:
-    """Return a table's title and its first two lines."""
-    names = ["claim", *map(short, table.columns), *["variants"] * table.has_variants, "verdict"]
-    return f"\n## {table.title}\n\n| {' | '.join(names)} |\n|{'---|' * len(names)}"
+    """Return an agent's name for the table: without TrXL, of which most are variants."""
+    return re.sub(r"^stack of (\d+)", r"\1 frames", suites.short(agent).removeprefix("TrXL, "))
 
 
 def mean_and_error(numbers: np.ndarray) -> str:
-    """Return the mean of numbers (R, M) with its standard error, without spaces: tables have many columns."""
+    """Return the mean of numbers (R, M) with its standard error, without spaces: cells hold several."""
     return tables.mean_and_error(numbers[..., None]).replace(" ", "")
 
 
-def row(table: Table, name: str, runs: dict[str, list[RunLog]], found: str) -> str:
-    """Return a claim's row, from the seeds of its agents: their means and standard errors, bold if expected higher."""
-    claim = table.claims[name]
-    numbers = {agent: mean_and_error(claim.numbers(runs[agent])) for agent in claim.agents}
-    if claim.expects_difference:
-        numbers |= {agent: f"**{numbers[agent]}**" for agent in claim.higher}
-    flags = f"(`{claim.flags}`)" if claim.flags else ""
-    cells = [
-        " ".join(filter(None, (f"`{name}`", claim.text, flags))),
-        *(numbers.get(agent, "") for agent in table.columns),
+def row(name: str, runs: dict[str, list[RunLog]], found: str, said: tuple[str, str]) -> str:
+    """Return a claim's row: what is said, and in the thesis; the agents' means with standard errors; the verdict."""
+    claim = CLAIMS[name]
+    agents = [
+        ", ".join(f"{short(agent)}: {mean_and_error(claim.numbers(runs[agent]))}" for agent in side)
+        for side in (claim.higher, claim.lower)
     ]
-    if table.has_variants:
-        variants = [agent for agent in claim.agents if agent not in table.columns]
-        cells.append(", ".join(f"{short(agent)}: {numbers[agent]}" for agent in variants))
-    return f"| {' | '.join([*cells, found])} |"
+    steps = f"{int(runs[claim.higher[0]][0].args['total_timesteps']) / 1e6:.4g}"
+    flags = f" (`{claim.flags}`)" if claim.flags else ""
+    return f"| {' | '.join([*said, *agents, steps, found, f'`{name}`{flags}'])} |"
 
 
 def judge(claim: Claim, runs: dict[str, list[RunLog]], without: list[RunLog]) -> Verdict:
@@ -371,11 +443,13 @@ def main(config: Config) -> None:
         without = finished(config, seeds, results)
         verdicts[name] = judge(claim, runs[name], without if len(without) == len(seeds) else [])
     stars = dict(zip(verdicts, holm([each.p_value for each in verdicts.values()]), strict=True))
-    for table in TABLES:
-        if names := [name for name in verdicts if name in table.claims]:
-            print(heading(table))
-        for name in names:
-            print(row(table, name, runs[name], verdicts[name].text + " \\*" * stars[name]))
+    if verdicts:
+        print(HEADING)
+    for statement in STATEMENTS:
+        said = statement.text, statement.thesis  # once, above rows that say the same of other tasks
+        for name in (name for name in verdicts if name in statement.claims):
+            print(row(name, runs[name], verdicts[name].text + " \\*" * stars[name], said))
+            said = "", ""
     counts = Counter(found.text for found in verdicts.values())
     summary = ", ".join(f"{count} {text}" for text, count in counts.most_common())
     print(f"\nOf {len(verdicts)} rows: {summary}. With a star: {sum(stars.values())}.")

@@ -1,4 +1,6 @@
-"""Print docs/options.md, the reset options of every environment, from the tables that the environments check against.
+"""Print docs/options.md: the reset options of every environment, and what its vector observation holds.
+
+Both come from the tables that the environments themselves are made of.
 
 python benchmarks/options_page.py > docs/options.md
 """
@@ -12,16 +14,31 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
 from memory_gym_envs import FAMILIES, Option
+from memory_gym_envs.entries import Entries, vector_slices
 from memory_gym_envs.options import LARGEST, LONGEST_LIST
 from memory_gym_envs.variant import Variant
 
-HEAD = f"""# Reset options
+OPTIONS = f"""# Options and vectors
 
-`reset(options={{...}})` and `gym.make(id, options={{...}})` take these options.
-[How long they hold](environments.md#options). Columns with an id are its defaults: a dash where it does not have the
-option, "ignored" where the option has no effect, as in the original.
+## Reset options
 
-Allowed values include both ends. `ints` is a list of 1 to {LONGEST_LIST} integers; one is sampled at every reset.
+`reset(options={{...}})` and `gym.make(id, options={{...}})` take these ([how long they hold](environments.md#options)).
+Columns with an id are its defaults: a dash where it does not have the option, "ignored" where the option has no effect,
+as in the original. Allowed values include both ends. `ints` is a list of 1 to {LONGEST_LIST} integers, of which a reset
+samples one.
+"""
+VECTORS = """## Vector observations
+
+With `obs_type="vector"`, observations are flat float32 vectors of what the image shows, and no image is drawn. Under
+the same options, two states with the same image have the same vector. What is not in sight is 0. A column with ids says
+where the entries are in their vector, counted from 0; its length is in brackets. Entries are from 0 to 1, unless a
+range stands beside them. Pixels count from the left and from the top of the 84 x 84 screen, x before y. The order of
+facings is up, up-left, left, and so on to up-right.
+
+- Where something hides a part of the agent, all facings that would look the same are 1, and the place is the middle of
+  all places that would. Agents so large that they hide whole tiles hide their entries, too.
+- In Searing Spotlights, what is seen below the bar is counted from every third pixel: a few visible pixels may count as
+  none.
 """
 
 
@@ -67,7 +84,7 @@ def names_in_order(variants: Mapping[str, Variant]) -> list[str]:
     return names
 
 
-def table(variants: Mapping[str, Variant]) -> str:
+def options_table(variants: Mapping[str, Variant]) -> str:
     """Return a family's table. Raises ValueError if an option does not mean the same in all ids."""
     lines = [f"| option | meaning | allowed | {' | '.join(variants)} |", "|---" * (3 + len(variants)) + "|"]
     for name in names_in_order(variants):
@@ -80,12 +97,40 @@ def table(variants: Mapping[str, Variant]) -> str:
     return "\n".join(lines)
 
 
-def page(head: str, table: Callable[[Mapping[str, Variant]], str]) -> str:
-    """Return a page as Markdown, with a table for each family."""
-    titles = [re.sub("(?<=[a-z])(?=[A-Z])", " ", family.__name__) for family in FAMILIES]
-    tables = [f"## {name}\n\n{table(family.variants)}\n" for name, family in zip(titles, FAMILIES, strict=True)]
+def cell(row: Entries | None, at: slice) -> str:
+    """Return where the entries are, with their range where it is not 0 to 1; a dash if the id has none."""
+    if row is None:
+        return "-"
+    place = f"{at.start}" if row.width == 1 else f"{at.start}-{at.stop - 1}"
+    return place if (row.low, row.high) == (0, 1) else f"{place} ({row.low:g} to {row.high:g})"
+
+
+def vectors_table(variants: Mapping[str, Variant]) -> str:
+    """Return a family's table, a column for all ids with the same entries.
+
+    Raises ValueError if entries do not mean the same in all ids.
+    """
+    ids: dict[tuple[Entries, ...], list[str]] = {}
+    meanings: dict[str, str] = {}
+    for id_, variant in variants.items():
+        ids.setdefault(variant.entries, []).append(id_)
+        for row in variant.entries:
+            if meanings.setdefault(row.name, row.meaning) != row.meaning:
+                raise ValueError(f"{row.name} of {id_} means something else in the ids before")
+    heads = [f"{', '.join(same)} ({sum(row.width for row in rows)})" for rows, same in ids.items()]
+    lines = [f"| name | meaning | {' | '.join(heads)} |", "|---" * (2 + len(ids)) + "|"]
+    for name, meaning in meanings.items():
+        cells = [cell({row.name: row for row in rows}.get(name), vector_slices(rows).get(name)) for rows in ids]
+        lines.append(f"| `{name}` | {meaning} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def part(head: str, table: Callable[[Mapping[str, Variant]], str], title: str) -> str:
+    """Return a part of the page as Markdown, with a table for each family."""
+    names = [re.sub("(?<=[a-z])(?=[A-Z])", " ", family.__name__) for family in FAMILIES]
+    tables = [f"### {title} {name}\n\n{table(each.variants)}\n" for name, each in zip(names, FAMILIES, strict=True)]
     return "\n".join([head, *tables])
 
 
 if __name__ == "__main__":
-    print(page(HEAD, table), end="")
+    print(part(OPTIONS, options_table, "Options of"), part(VECTORS, vectors_table, "Vectors of"), sep="\n", end="")

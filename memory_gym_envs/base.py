@@ -52,8 +52,8 @@ wrong options raise ValueError.
 | `max_episode_steps` | None | truncates longer episodes |
 | `autoreset_mode` | SAME_STEP | of `make_vec` alone: when an episode that ended is reset |
 
-`reset(options={...})` takes the same reset parameters, a single environment for one episode. `docs/options.md` and
-`VARIANTS[id].options` list them. Of a list, one entry is sampled at every reset. `docs/vectors.md` describes vectors.
+`reset(options={...})` takes the same reset parameters, a single environment for one episode. `VARIANTS[id].options` and
+`docs/options.md` list them; of a list, one entry is sampled at every reset. The same page describes vectors.
 
 ## References
 

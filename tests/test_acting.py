@@ -102,7 +102,7 @@ def code_of(page):
 ])  # fmt: skip
 def test_a_step_is_exported_as_documented(trained, script, changes, monkeypatch):
     """Over 20 steps of two episodes, a window of 7 included: the agent's own logits and values, to 1e-6."""
-    (_, load, gru, trxl, export) = code_of("docs/agents.md")
+    (_, load, gru, trxl, export) = code_of("docs/evaluation.md")
     names = {"path": str(trained(script, 1, env_id="MysteryPath-Grid-v0", value_init_gain=0.5, **changes))}
     exec("\n".join([load, gru if script is ppo_gru else trxl, export]), names)
     agent, step, state = names["player"].agent, names["exported"].module(), names["beginning"]

@@ -1,4 +1,4 @@
-"""docs/add_a_memory.md: who follows it has a script that passes the suite and trains."""
+"""docs/extend.md, a memory: who follows it has a script that passes the suite and trains."""
 
 import re
 import shutil
@@ -9,7 +9,7 @@ import pytest
 from programs import Program, command, elsewhere
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs/add_a_memory.md").read_text()
+PAGE = (ROOT / "docs/extend.md").read_text().split("\n## ")[1]
 (MEMORY,) = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
 FLAGS = re.findall(r"`(\w+)`", PAGE.split("delete the old memory's flags:")[1].split(".")[0])
 

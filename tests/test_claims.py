@@ -1,5 +1,6 @@
 """benchmarks/claims.py: its verdicts, and one claim from its trainings to its row."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -141,6 +142,7 @@ def test_runs_with_test_levels_are_compared_with_runs_without():
 def test_short_names():
     assert claims.short("GTrXL") == "GTrXL"
     assert claims.short("TrXL") == "TrXL"
+    assert claims.short("stack of 16") == "16 frames"
     assert claims.short(f"{claims.QUERY_POSITION} --trxl-dim 96") == "query position, dim 96"
     assert claims.short(claims.NORMALIZED) == "GRU, norm adv minibatch"
 
@@ -186,8 +188,9 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
         runs = [learning.result_of(config, each) for each in claims.CLAIMS["normalized-gradients"].plans(config, agent)]
         norms = [run.curves["losses/grad_norm"][1].mean() for run in runs]
         cells.append(tables.mean_and_error(np.reshape(norms, (2, 1, 1))).replace(" ", ""))
-    row = f"| `normalized-gradients` (`--target-kl None`) | {cells[0]} | **{cells[1]}** |  | "
-    assert any(line.startswith(row) for line in told.splitlines())
+    (row,) = (line for line in told.splitlines() if line.endswith(" | `normalized-gradients` (`--target-kl None`) |"))
+    start = "| 7.2 Normalized advantages make gradients larger | over 12 times"
+    assert row.startswith(f"{start} | GRU, norm adv minibatch: {cells[1]} | GRU: {cells[0]} | ")
     assert told.splitlines()[-1].startswith("Of 1 rows: 1 ")
     claims.main(config)
     assert "trained" not in capsys.readouterr().out
@@ -211,8 +214,28 @@ def test_what_is_learned_is_judged_by_all_runs_without_memory(monkeypatch, capsy
         mean = 1.0 + 0.1 * plan.seed + (plan.agent == "no memory")
         curve = np.array([100]), np.full((1, 4, 1), mean)
         there = plan.agent != "no memory" or plan.seed in seeds
-        return RunLog("", {}, {"eval/carried_out": curve}) if there else None
+        return RunLog("", plan.logged_args(), {"eval/carried_out": curve}) if there else None
 
     monkeypatch.setattr(learning, "result_of", result_of)
     claims.main(claims.Config(claims=("score-endless-mortar-mayhem",), report=True))
     assert f"Of 1 rows: 1 {text}." in capsys.readouterr().out
+
+
+def test_a_statement_stands_once_above_its_claims():
+    """What is said of the first task is said of those that follow; each claim has one statement."""
+    names = [name for statement in claims.STATEMENTS for name in statement.claims]
+    assert len(set(names)) == len(names) == len(claims.CLAIMS)
+    assert all(re.match(r"[67](\.\d)+ [A-Z1]", statement.text) for statement in claims.STATEMENTS)
+
+
+def test_rows_of_one_statement(monkeypatch, capsys):
+    curve = np.array([100]), np.full((1, 4, 1), 0.5)
+    run = RunLog("", {"total_timesteps": 3e6}, {"eval/carried_out": curve})
+    monkeypatch.setattr(learning, "result_of", lambda config, plan: run)
+    tasks = ("MortarMayhem-Grid-v0", "MortarMayhem-v0")
+    claims.main(claims.Config(claims=tuple(f"lstm-score-{task}" for task in tasks), report=True))
+    cells = "GRU: 0.50±0.00 | LSTM: 0.50±0.00 | 3 | not learned"
+    assert capsys.readouterr().out.splitlines()[3:5] == [
+        f"| 6.2.3 LSTM is behind GRU in Mortar Mayhem | LSTM 3 commands | {cells} | `lstm-score-{tasks[0]}` |",
+        f"|  |  | {cells} | `lstm-score-{tasks[1]}` |",
+    ]

@@ -282,7 +282,7 @@ def test_page_names_the_curves(tiny, scalars):
 
 def test_page_plays_an_agent(monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
-    source = re.search(r"```python\n(.*?)```", (ROOT / "docs/agents.md").read_text(), re.DOTALL).group(1)
+    source = re.search(r"```python\n(.*?)```", (ROOT / "docs/evaluation.md").read_text(), re.DOTALL).group(1)
     torch.manual_seed(1)
     exec(source, {})
     assert 0 < float(capsys.readouterr().out.split()[-1]) <= 1

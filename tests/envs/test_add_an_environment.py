@@ -1,4 +1,4 @@
-"""docs/add_an_environment.md: its family has all that those of the package have."""
+"""docs/extend.md, an environment: its family has all that those of the package have."""
 
 import importlib
 import pickle
@@ -15,7 +15,7 @@ from helpers import check_same, roll
 
 from ppo_utils.environments import is_memory_gym, make_envs
 
-PAGE = (Path(__file__).parents[2] / "docs/add_an_environment.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs/extend.md").read_text().split("\n## An environment\n")[1]
 OPTIONS = {"delay": 3, "reward_success": 0.5}
 
 
