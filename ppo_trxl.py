@@ -158,9 +158,8 @@ QUICKSTART = {
     **LAPTOP, "preset": "quickstart",
     # Two commands, each shown for one step, and six steps to carry one out.
     "env_options": '{"command_count": [2], "command_show_duration": [1], "command_show_delay": [0], '
-    '"explosion_delay": [4], "explosion_duration": [2]}',
+    '"explosion_delay": [4], "explosion_duration": [2]}', "total_timesteps": 400_000,
     "trunk_size": 64, "num_steps": 32, "num_minibatches": 8, "gamma": 0.99, "vf_coef": 0.5, "init_lr": 4e-3,
-    "total_timesteps": 400_000,
 }  # fmt: skip
 PRESETS = {"thesis": {}, "laptop": LAPTOP, "quickstart": QUICKSTART}  # thesis: the defaults above
 
