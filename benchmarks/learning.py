@@ -55,8 +55,7 @@ from ppo_utils.scores import own_metric
 from suites import AGENTS, SUITES, TASKS, Task, short
 
 ROOT = Path(__file__).parent.parent
-# Most results are older than the last changes of the preset. An agent's own flags override these.
-COMMON = "--preset laptop --save-model --value-init-gain 1 --no-attend-commands"
+COMMON = "--preset laptop --save-model"  # an agent's own flags override these
 FIRST_TEST_LEVEL = 1_000_000
 # Scalars that tell how an iteration's update went.
 UPDATE_CURVES = ("losses/grad_norm", "losses/entropy", "charts/gradient_steps", "charts/learning_rate")
@@ -167,7 +166,7 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
     }
     name, dashes, further = agent.partition(" --")
     script, *memory = AGENTS.get(name, name).split()
-    flags = [*COMMON.split(), *memory, *task.flags.split(), *(task.trxl_flags.split() if "trxl" in script else [])]
+    flags = [*COMMON.split(), *memory, *(task.trxl_flags.split() if "trxl" in script else [])]
     flags += ["--anneal-steps", str(steps)]
     for each, value in of_the_suite.items():
         flags += [f"--{each.replace('_', '-')}", str(value)]

@@ -6,8 +6,10 @@ from dataclasses import dataclass, field, replace
 
 from ppo_utils.scores import own_metric
 
-# What --preset laptop was until Muon: the agents of the suites small and full have these settings.
-ADAMW = "--optimizer adamw --no-norm-reward --num-envs 32 --update-epochs 4 --num-minibatches 8"
+# What --preset laptop was when the older results were made.
+EARLY = "--value-init-gain 1 --no-attend-commands"
+# What it was until Muon: the agents of the suites small and full have these settings.
+ADAMW = f"{EARLY} --optimizer adamw --no-norm-reward --num-envs 32 --update-epochs 4 --num-minibatches 8"
 ADAMW += " --init-lr 1e-3 --final-lr 1e-4 --init-ent-coef 5e-4 --final-ent-coef 5e-5"
 GRU = f"ppo_gru.py {ADAMW}"
 BEFORE = "ppo_trxl.py --init-lr 1e-3 --gamma 0.99 --vf-coef 0.5"  # what --preset laptop had for the transformer
@@ -22,10 +24,10 @@ MEMORIES = {
 # The thesis' exploration bonus, with the weights that suit it on these tasks; the preset has the log barrier.
 ENTROPY = "--exploration-bonus entropy --init-ent-coef 1e-3 --final-ent-coef 1e-4"
 MUON = {  # --preset laptop, with what all agents have (learning.COMMON)
-    "no memory, Muon": "ppo_gru.py --memory none",
-    "stack of 16, Muon": "ppo_gru.py --memory none --frame-stack 16",
-    "GRU, Muon": "ppo_gru.py",
-    "TrXL, Muon": BEFORE,
+    "no memory, Muon": f"ppo_gru.py --memory none {EARLY}",
+    "stack of 16, Muon": f"ppo_gru.py --memory none --frame-stack 16 {EARLY}",
+    "GRU, Muon": f"ppo_gru.py {EARLY}",
+    "TrXL, Muon": f"{BEFORE} {EARLY}",
 }
 # Muon with what the thesis has: smaller steps, a longer horizon, rewards as they are.
 LOW_RATE = "--init-lr 3e-4 --gamma 0.995 --clip-coef 0.1 --no-norm-reward"
@@ -38,11 +40,10 @@ AGENTS = {
     **MEMORIES,
     "TrXL, preset": ADAMW_TRXL,
     **MUON,
+    "TrXL, laptop": BEFORE,
     # --preset laptop as it is.
-    "TrXL, one preset": "ppo_trxl.py --attend-commands --value-init-gain 0.01",
-    # What --preset laptop was when it came to read lists by attention.
-    "GRU, laptop": "ppo_gru.py --attend-commands",
-    "TrXL, laptop": f"{BEFORE} --attend-commands --value-init-gain 0.01",
+    "GRU, laptop": "ppo_gru.py",
+    "TrXL+": "ppo_trxl.py",
     **{f"{name}, low rate": f"{flags} {LOW_RATE}" for name, flags in MUON.items()},
     **{f"{name}, entropy": f"{flags} {ENTROPY}" for name, flags in MEMORIES.items()},
     **{f"{name}, refreshed": f"{flags} --refresh-memory" for name, flags in MEMORIES.items()},
@@ -61,7 +62,6 @@ class Task:
     env_id: str
     total_timesteps: int
     options: dict = field(default_factory=dict)
-    flags: str = ""
     trxl_flags: str = ""  # the transformer's own
 
     @property
@@ -99,10 +99,8 @@ SMALL = {
         # All paths begin at the left, and each of their tiles pays a tenth of the goal's reward when first reached:
         # without this, chance finds too few goals.
         {"cardinal_origin_choice": [0], "reward_path_progress": 0.1},
-        # To remember tiles, an agent has to tell them apart; their coordinates alone differ by a seventh.
-        "--vector-frequencies 4",
         # Where the agent fell matters, not when.
-        "--trxl-positional-encoding none",
+        trxl_flags="--trxl-positional-encoding none",
     ),
     "endless-mortar-mayhem": Task(
         "Endless-MortarMayhem-v0",
@@ -120,8 +118,7 @@ SMALL = {
     ),
 }
 FULL = {  # trained for what two cores can do in a day, all agents and seeds together; few agents converge
-    # As in the small task, an agent has to tell tiles apart to remember them.
-    env_id: Task(env_id, 1_000_000 * millions, flags="--vector-frequencies 4" if "MysteryPath" in env_id else "")
+    env_id: Task(env_id, 1_000_000 * millions)
     for env_id, millions in {
         "MortarMayhem-v0": 3,
         "MortarMayhem-Grid-v0": 6,
@@ -141,8 +138,11 @@ LAPTOP = {
     for env_id, millions in {
         "MortarMayhem-v0": 12,
         "MortarMayhem-Grid-v0": 6,
+        "MortarMayhemB-v0": 6,
         "MortarMayhemB-Grid-v0": 6,
         "Endless-MortarMayhem-v0": 9,
+        "MysteryPath-v0": 6,
+        "MysteryPath-Grid-v0": 15,
         "Endless-MysteryPath-v0": 3,
         "SearingSpotlights-v0": 6,
         "Endless-SearingSpotlights-v0": 9,

@@ -40,7 +40,7 @@ RENAMED_WEIGHTS = {
     ".merge_output.": ".merge_projection.",
 }
 # What a flag stood for in files that are older than it, where its default is another one now.
-FORMER_DEFAULTS = {"value_init_gain": 1.0}
+FORMER_DEFAULTS = {"value_init_gain": 1.0, "vector_frequencies": 0}
 CHECKPOINTS_KEPT = 2
 SCRIPT_NAME = r"ppo_\w+"  # of what a file may import
 

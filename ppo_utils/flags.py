@@ -11,6 +11,7 @@ import tyro
 from torch import nn
 from tyro.constructors import PrimitiveConstructorSpec
 
+from memory_gym_envs.mystery_path import VARIANTS as MYSTERY_PATH
 from ppo_utils.processes import rank_and_size
 
 type_hints = functools.cache(get_type_hints)  # a program that plans hundreds of trainings asks for each
@@ -118,8 +119,9 @@ class RunArgs:
     """also observe the last action and the last reward"""
     spotlight_perturbation: bool = False
     """cover the image with a translucent white layer in which moving spotlights leave holes (thesis §7.2)"""
-    vector_frequencies: bounded(int, 0, 16) = 0
-    """also observe Fourier features of vectors with entries from 0 to 1, at this many frequencies"""
+    vector_frequencies: bounded(int, 0, 16) | None = None
+    """also observe Fourier features of vectors with entries from 0 to 1, at this many frequencies (None: 4 in Mystery
+    Path, else 0)"""
 
     eval_interval: NonNegativeInt = 0
     """iterations between evaluations on unseen levels, with another one at the end (0: no evaluations)"""
@@ -183,6 +185,8 @@ def check_args(args: RunArgs) -> None:
         raise ValueError("--auxiliary-detach needs --reconstruction-coef or --ground-truth-coef above 0")
     if args.anneal_steps is None:
         args.anneal_steps = args.total_timesteps
+    if args.vector_frequencies is None:  # an agent that remembers tiles has to tell neighbours apart
+        args.vector_frequencies = 4 if args.obs_type == "vector" and args.env_id in MYSTERY_PATH else 0
     if args.refresh_memory and args.update_epochs == 1:
         raise ValueError("--refresh-memory needs --update-epochs above 1: the first epoch has fresh memory")
     batch_size = args.num_envs * args.num_steps

@@ -24,7 +24,7 @@ def follow(folder):
     for name in ("ppo_gru.py", "ppo_trxl.py", "evaluate.py", "enjoy.py", "enjoy.html", "pyproject.toml"):
         shutil.copy(ROOT / name, folder / name)
     for name in ("ppo_utils", "memory_gym_envs", "tests", "benchmarks"):
-        ignored = shutil.ignore_patterns("__pycache__", "results", "tuning")
+        ignored = shutil.ignore_patterns("__pycache__", "results")
         shutil.copytree(ROOT / name, folder / name, ignore=ignored)
     script = (ROOT / "ppo_gru.py").read_text()
     memory = script[script.index("@dataclass\nclass MemoryState:") : script.index("\n\n# ---- 5 AGENT ----")]

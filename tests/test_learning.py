@@ -26,7 +26,7 @@ import learning
 import ppo_gru
 import tables
 from ppo_utils.checkpoints import read_checkpoint
-from ppo_utils.run_logs import SECONDS, RunLog, with_defaults
+from ppo_utils.run_logs import SECONDS, RunLog
 from ppo_utils.runs import run_to_end
 from ppo_utils.scores import iqm
 from suites import short
@@ -45,11 +45,12 @@ def test_every_agent_s_command_can_be_parsed(task, agent):
     assert args.total_timesteps == args.anneal_steps == 6_000_000
     assert args.refresh_memory == ("refreshed" in agent)
     # The thesis' queries do not know their step.
-    of_a_preset = agent.startswith(("TrXL, preset", "TrXL, Muon", "TrXL, laptop", "TrXL, one preset"))
+    of_a_preset = agent.startswith(("TrXL, preset", "TrXL, Muon", "TrXL, laptop", "TrXL+"))
     assert getattr(args, "trxl_query_position", False) == of_a_preset
     assert getattr(args, "trxl_memory_gradient", False) == ("gradient" in agent or of_a_preset)
-    assert getattr(args, "trxl_gate", None) == {"TrXL": "none", "GTrXL": "gru"}.get(agent.split(",")[0])
-    assert (args.init_lr == 3e-4) == (args.gamma == 0.995) == ("low rate" in agent or "one preset" in agent)
+    gate = {"TrXL": "none", "TrXL+": "none", "GTrXL": "gru"}.get(agent.split(",")[0])
+    assert getattr(args, "trxl_gate", None) == gate
+    assert (args.init_lr == 3e-4) == (args.gamma == 0.995) == ("low rate" in agent or agent == "TrXL+")
     assert (args.clip_coef == 0.1) == ("low rate" in agent)
 
 
@@ -152,8 +153,8 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     monkeypatch.chdir(config.folder)
     plan = learning.plan(config, task, agent, 1)
     args = parse_args(ppo_gru, *plan.command[2:])
-    assert args == plan.args
     run = ppo_gru.setup(args)
+    assert args == plan.args
     run.received_signal = signal.SIGTERM  # during the first of three iterations
     run_to_end(args, run, ppo_gru.train)
 
@@ -421,14 +422,3 @@ def test_only_the_agents_to_draw_are_drawn(tmp_path, monkeypatch):
     config = learning.Config(suite="laptop", tasks=(task,), draw=("GRU, Muon",), report=True)
     learning.main(replace(config, results=ROOT / "benchmarks/results"))
     assert [*drawn[task]] == ["GRU, Muon"]
-
-
-@pytest.mark.parametrize("agent", ["GRU", "TrXL, Muon", "ppo_gru.py --preset thesis", "GRU --value-init-gain 0.01"])
-def test_the_first_values_are_those_of_the_results(agent):
-    """These were trained when --value-init-gain 1 was the default, or without that flag, as it was before."""
-    plan = learning.plan(learning.Config(), learning.TASKS["mortar-mayhem"], agent, 1)
-    assert "--value-init-gain 1" in " ".join(plan.command)
-    assert plan.args.value_init_gain == (0.01 if "0.01" in agent else 1.0)
-    older = {name: text for name, text in plan.logged_args().items() if name != "value_init_gain"}
-    if "0.01" not in agent:
-        assert with_defaults(older) == plan.logged_args()

@@ -20,9 +20,9 @@ import frontier
 import learning
 import ppo_gru
 import seeds
+import speedrun
 import tables
 import trained_paths
-import tuning
 from ppo_utils import evaluation
 
 ROOT = Path(__file__).parents[1]
@@ -34,8 +34,7 @@ def read_once():
     gc.disable()
     with pytest.MonkeyPatch.context() as patch:
         read = functools.cache(learning.read_run)
-        for program in (learning, tuning):
-            patch.setattr(program, "read_run", lambda path: read(os.path.realpath(path)))
+        patch.setattr(learning, "read_run", lambda path: read(os.path.realpath(path)))
         yield
     gc.enable()
 
@@ -97,8 +96,8 @@ def test_how_often_a_test_level_s_path_was_trained_on(tiny):
         assert times.tolist() == wanted
 
 
-def test_the_table_of_minutes_is_printed_by_its_command(capsys):
-    tuning.main(tuning.Config())
+def test_the_table_of_the_fastest_is_printed_by_its_command(capsys):
+    speedrun.main()
     assert capsys.readouterr().out in (ROOT / "docs/tuning.md").read_text()
 
 

@@ -128,7 +128,7 @@ def test_trains(tiny, scalars, env_id, memory):
 
 def test_trains_on_vectors_and_their_frequencies(tiny, scalars):
     """The network takes the Fourier features, and a model that is older than the flag is one without them."""
-    vectors = {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "vector_frequencies": 4, "save_model": True}
+    vectors = {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "save_model": True}
     folder = ppo_gru.main(tiny(**vectors))
     assert all(error < 1e-5 for error in scalars(folder)["losses/ratio_error"])
     path = os.path.join(folder, "model.pt")
@@ -137,6 +137,22 @@ def test_trains_on_vectors_and_their_frequencies(tiny, scalars):
     del saved["args"]["vector_frequencies"]
     torch.save(saved, path)
     assert saved_args(ppo_gru.Args, read_model(path)).vector_frequencies == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "frequencies"),
+    [
+        ({"env_id": "MysteryPath-v0"}, 4),
+        ({"env_id": "Endless-MysteryPath-v0", "vector_frequencies": 0}, 0),
+        ({"env_id": "MysteryPath-v0", "obs_type": "pixels"}, 0),
+        ({"env_id": "MortarMayhem-v0"}, 0),
+        ({"env_id": "MortarMayhem-v0", "vector_frequencies": 2}, 2),
+    ],
+)
+def test_frequencies_are_mystery_path_s_unless_asked_for(changes, frequencies):
+    args = ppo_gru.Args(**{"obs_type": "vector", **changes})
+    check_args(args)
+    assert args.vector_frequencies == frequencies
 
 
 def test_a_newer_flag_keeps_its_value():
@@ -150,7 +166,8 @@ def test_flags_that_were_renamed(tiny):
     """An older file has them by their former names."""
     args = {"head_size": 7, "seed": 3, "no_longer": 1}
     torch.save({"script": "ppo_gru", "args": args, "weights": {}}, "model.pt")
-    assert saved_args(ppo_gru.Args, read_model("model.pt")) == ppo_gru.Args(trunk_size=7, seed=3, value_init_gain=1.0)
+    expected = ppo_gru.Args(trunk_size=7, seed=3, value_init_gain=1.0, vector_frequencies=0)
+    assert saved_args(ppo_gru.Args, read_model("model.pt")) == expected
 
 
 def test_weights_that_were_renamed(tiny):
@@ -361,7 +378,7 @@ def test_save_and_load(tiny, opened, memory):
     path = os.path.join(folder, "model.pt")
     saved = read_model(path)
     args, weights = saved_args(script.Args, saved), saved["weights"]
-    assert args == tiny(env_id="CueRecall-v0", save_model=True, **memory)
+    assert args == tiny(env_id="CueRecall-v0", save_model=True, vector_frequencies=0, **memory)
     assert all(weight.device.type == "cpu" for weight in weights.values())
     run = opened(script, tiny(env_id="CueRecall-v0", load_model=path, exp_name="again", seed=9, **memory))
     for name, weight in run.agent.state_dict().items():

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from programs import run_command
 
+import learning
+import speedrun
 import tables
-import tuning
 from ppo_utils.run_logs import RunLog
 from suites import AGENTS, COLORS, SUITES, TASKS, short
 
@@ -227,13 +227,6 @@ def test_what_the_thesis_reports_is_of_the_ten_tasks():
     assert tables.read_thesis()["MortarMayhem-v0"] == "0.6, > 0.6"
 
 
-def test_a_table_of_minutes_needs_results(tmp_path, monkeypatch):
-    monkeypatch.setattr(tuning, "RESULTS", tmp_path)
-    task, script = next(iter(tuning.read_speeds()))
-    with pytest.raises(SystemExit, match=f"no results of {script} in {task}; learning.py trains"):
-        tuning.main(tuning.Config())
-
-
 def test_the_axis_of_a_single_seed(tmp_path, monkeypatch):
     """It has no standard error: the axis ends at its highest mean."""
     drawn = []
@@ -243,52 +236,44 @@ def test_the_axis_of_a_single_seed(tmp_path, monkeypatch):
     assert [axis.get_ylim() for axis in drawn[0].axes] == [(0, 1), (0, 7)]
 
 
-HEAD = "task,script,steps_per_second\n"
+ENTRY = 'task,target,agent,steps,date,commit\nSearingSpotlights-v0,0.9,"GRU, laptop",6e6,2026-11-29,abc1234\n'
 
 
-def test_a_speed_is_that_of_the_whole_training_on_one_core(tmp_path, monkeypatch):
-    """Other tasks keep theirs, and all stay until all are measured."""
-    kept = [f"SearingSpotlights-v0,{script},7" for script in tuning.AGENTS]
-    old = [f"MortarMayhem-Grid-v0,{script},0" for script in reversed(tuning.AGENTS)]
-    before = HEAD + "\n".join([*kept, *old])
-    monkeypatch.setattr(tuning, "SPEEDS", tmp_path / "speeds.csv")
-    monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    tuning.SPEEDS.write_text(before)
+@pytest.fixture
+def entry(tmp_path, monkeypatch):
+    """Return a function that makes an entry's row, from the mean score of each seed."""
 
-    def run(command, check, cwd, env):
-        assert (env["OMP_NUM_THREADS"], tuning.SPEEDS.read_text()) == ("1", before)
-        Path(cwd, "runs", "it").mkdir(parents=True)
+    def row(*means):
+        runs = [run_with(0, 0, mean, metric="test/success") for mean in means]
+        results = {"SearingSpotlights-v0": {"GRU, laptop": runs}}
+        monkeypatch.setattr(learning, "results_of", lambda config, plans: results)
+        (tmp_path / "speedrun.csv").write_text(ENTRY)
+        monkeypatch.setattr(speedrun, "ENTRIES", tmp_path / "speedrun.csv")
+        speedrun.main()
 
-    speeds = {"charts/SPS": (np.array([128, 256]), np.reshape([10.0, 20.4], (2, 1, 1)))}
-    monkeypatch.setattr(tuning.subprocess, "run", run)
-    monkeypatch.setattr(tuning, "read_run", lambda path: RunLog(path, {}, speeds))
-    asked, measure = [], tuning.measure_speeds
-    monkeypatch.setattr(tuning, "measure_speeds", lambda tasks: (asked.append(tasks), measure(tasks)))
-    monkeypatch.setattr(tuning, "table", lambda speeds: "")
-    tuning.main(tuning.Config())
-    assert asked == []
-    tuning.main(tuning.Config(measure=("MortarMayhem-Grid-v0",)))
-    head, *rows = tuning.SPEEDS.read_text().splitlines()
-    assert f"{head}\n" == HEAD
-    assert sorted(rows[:2]) == sorted(f"MortarMayhem-Grid-v0,{script},20" for script in tuning.AGENTS)
-    assert rows[2:] == kept
-    with pytest.raises(SystemExit, match="there is no 'mortar-mayhem'; there are MortarMayhem"):
-        measure(("mortar-mayhem",))
+    return row
 
 
-def test_a_speed_is_measured(tmp_path, monkeypatch):
-    """Here of a training of an iteration."""
+def test_an_entry_has_its_score_and_minutes(entry, capsys):
+    entry(0.95, 0.94, 0.96, 0.95, 0.95)
+    row = "| SearingSpotlights-v0 | 0.9 | `GRU, laptop` | 0.95 ± 0.00 | 0.0000 | 6 M | 3.0 | 2026-11-29, abc1234 |"
+    assert capsys.readouterr().out.splitlines()[-1] == row
 
-    def run(command, check, cwd, env):
-        assert run_command(*command[1:], folder=cwd).returncode == 0
 
-    monkeypatch.setattr(tuning.subprocess, "run", run)
-    monkeypatch.setattr(tuning, "SPEEDS", tmp_path / "speeds.csv")
-    monkeypatch.setattr(tuning, "STEPS", 256)
-    tuning.SPEEDS.write_text(HEAD)
-    agent = "TrXL, Muon --num-envs 4 --num-steps 32 --num-minibatches 2"
-    monkeypatch.setattr(tuning, "AGENTS", {"ppo_trxl.py": agent})
-    tuning.measure_speeds(("MortarMayhem-Grid-v0",))
-    ((key, speed),) = tuning.read_speeds().items()
-    assert key == ("MortarMayhem-Grid-v0", "ppo_trxl.py")
-    assert speed > 0
+@pytest.mark.parametrize(
+    ("means", "message"),
+    [
+        ((0.95, 0.95, 0.95, 0.95), "has 4 of 5 seeds of GRU, laptop in SearingSpotlights-v0"),
+        ((0.99, 0.99, 0.99, 0.85, 0.89), r"GRU, laptop in SearingSpotlights-v0 is not above 0.9: p = 0.1"),
+    ],
+)
+def test_what_is_no_entry(entry, means, message):
+    with pytest.raises(SystemExit, match=message):
+        entry(*means)
+
+
+def test_a_mean_above_the_target():
+    """Here by 5 standard errors, 0.02 / sqrt(4) each: with three degrees of freedom, p is 0.0077."""
+    means = 0.95 + 0.02 * np.sqrt(0.75) * np.array([1, 1, -1, -1])
+    assert speedrun.probability(means, 0.9) == pytest.approx(0.0077, abs=5e-5)
+    assert speedrun.probability(means, 1.0) == pytest.approx(1 - 0.0077, abs=5e-5)

@@ -1,0 +1,79 @@
+"""Who learns a task to its target with the fewest minutes or steps? The table of docs/tuning.md, whose rules these are.
+
+    python benchmarks/speedrun.py
+
+Prints each entry of benchmarks/speedrun.csv with what its runs in benchmarks/results reached. Shape letters: R seeds, M
+test levels, E episodes on each.
+"""
+
+import csv
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.stats
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
+
+import learning
+import tables
+from suites import TASKS
+
+RESULTS, ENTRIES = (Path(__file__).with_name(name) for name in ("results", "speedrun.csv"))
+SEEDS = (1, 2, 3, 4, 5)
+LEVEL = 0.01  # of the test that the mean is above the target
+HEADING = """| task | target | agent | score | p | steps | minutes | date, commit |
+|---|---:|---|---:|---:|---:|---:|---|"""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A line of the file: what was trained, and when."""
+
+    task: str
+    target: float
+    agent: str  # as learning.py --agents takes it
+    steps: int
+    date: str
+    commit: str
+
+
+def read_entries() -> list[Entry]:
+    """Read the entries in the order of the file."""
+    with ENTRIES.open(newline="") as file:
+        rows = [*csv.DictReader(file)]
+    return [Entry(**{**row, "target": float(row["target"]), "steps": int(float(row["steps"]))}) for row in rows]
+
+
+def row(entry: Entry) -> str:
+    """Return an entry's row of the table.
+
+    Raises SystemExit if a seed has no result, or if they are not above the target: then it is no entry.
+    """
+    how = {"steps": entry.steps, "seeds": SEEDS, "results": RESULTS}
+    config = learning.Config(suite="laptop", tasks=(entry.task,), agents=(entry.agent,), **how)
+    (runs,) = learning.results_of(config, learning.plans_of(config))[entry.task].values()
+    if len(runs) < len(SEEDS):
+        raise SystemExit(f"{RESULTS} has {len(runs)} of {len(SEEDS)} seeds of {entry.agent} in {entry.task}")
+    scores = tables.final_scores(TASKS[entry.task].score, runs)  # (R, M, E)
+    p_value = probability(scores.mean((1, 2)), entry.target)
+    if p_value >= LEVEL:
+        raise SystemExit(f"{entry.agent} in {entry.task} is not above {entry.target:g}: p = {p_value:.3f}")
+    cells = [entry.task, f"{entry.target:g}", f"`{entry.agent}`", tables.mean_and_error(scores), f"{p_value:.4f}"]
+    cells += [f"{entry.steps / 1e6:g} M", f"{tables.minutes_of(runs):.1f}", f"{entry.date}, {entry.commit}"]
+    return f"| {' | '.join(cells)} |"
+
+
+def probability(means: np.ndarray, target: float) -> float:
+    """Return the p-value of seeds' means (R,) against a true mean at the target or below (Student's t-test)."""
+    return float(scipy.stats.ttest_1samp(means, target, alternative="greater").pvalue)
+
+
+def main() -> None:
+    """Print the table. Raises SystemExit as `row` does."""
+    print("\n".join([HEADING, *map(row, read_entries())]))
+
+
+if __name__ == "__main__":
+    main()
