@@ -1,7 +1,7 @@
 """What a frame tells of the agent: where it is and which way it faces, as far as nothing hides it.
 
-The screen's edge, a symbol or a cross may hide so much of an agent that several places and facings look the same. The
-tables made here say which, so that a vector observation knows no more than who sees the frame.
+The screen's edge, a symbol or a cross may hide so much of an agent that several positions and facings look the same.
+The tables made here say which, so that a vector observation knows no more than who sees the frame.
 Shape letters: R sprites (the facings of all views), W a sprite's width, P stored positions along one axis, N lanes, n
 some of them, V entries of a vector.
 """
@@ -20,17 +20,17 @@ BODY_SIZES = np.arange(1 + LARGEST_RADIUS) / LARGEST_RADIUS
 VALUES = np.concatenate([PIXELS / SCREEN, BODY_SIZES]).astype(np.float32)
 FLAGS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little").astype(np.float32)
 HIDDEN = (UNSEEN, UNSEEN, UNSEEN, 0)  # the codes
-PLACE_STRIDES = np.array([1, SPAN])
+POSITION_STRIDES = np.array([1, SPAN])
 CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # (4, 2) of a square, in units of its width
 
 
 def agent_entries(low: int, high: int) -> tuple[Entries, ...]:
     """The first entries of a vector, for agents whose centre stays between these pixels on both axes."""
     size = f"radius of the agent's body, / {LARGEST_RADIUS} pixels; 0: none of it is visible"
-    place = "the agent's centre, x and y, / 84 pixels; the middle of all places that would look the same"
+    centre = "the agent's centre, x and y, / 84 pixels; the middle of all places that would look the same"
     facing = "the agent's facing, one-hot; 1 for each that would look the same"
     ends = min(low / SCREEN, 0.0), high / SCREEN
-    return Entries("size", 1, size), Entries("place", 2, place, *ends), Entries("facing", FACINGS, facing)
+    return Entries("size", 1, size), Entries("place", 2, centre, *ends), Entries("facing", FACINGS, facing)
 
 
 class View(NamedTuple):
@@ -53,8 +53,8 @@ class AppearanceTables(NamedTuple):
     def covered(self, sprite: np.ndarray, pos: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Which pixels lie under the agents: (n, k) bool for points (n, k, 2), x and y with PAD."""
         width = self.solid.shape[1]
-        place = (points - pos[:, None] + width // 2).clip(0, width - 1)
-        return self.solid[sprite[:, None], place[..., 1], place[..., 0]]
+        pixel = (points - pos[:, None] + width // 2).clip(0, width - 1)
+        return self.solid[sprite[:, None], pixel[..., 1], pixel[..., 0]]
 
 
 def tables_of(views: list[View]) -> AppearanceTables:
@@ -75,7 +75,7 @@ def appearance_codes(view: View) -> np.ndarray:
     facing, y, x = (index.reshape(-1) for index in np.indices(hashes.shape))
     same_look, count = np.zeros((kind.max() + 1, FACINGS), bool), np.bincount(kind)
     same_look[kind, facing] = True
-    column, row = (np.rint(np.bincount(kind, place) / count) for place in (x, y))
+    column, row = (np.rint(np.bincount(kind, index) / count) for index in (x, y))
     size = np.full_like(count, UNSEEN + radius_of(view.scale))
     facings = np.packbits(same_look, axis=1, bitorder="little")
     codes = np.column_stack([size, column + view.columns.start, row + view.rows.start, facings]).astype(np.uint8)
@@ -89,17 +89,17 @@ def appearance_codes(view: View) -> np.ndarray:
 def appearance_hashes(view: View) -> np.ndarray:
     """(FACINGS, rows, columns) uint64: numbers that differ where the agents look different; 0 where nothing shows.
 
-    The sum over all pixels that show of their colour times their place on the screen, a random number. So two pictures
-    have the same number by a chance of one in 2**64.
+    The sum over all pixels that show of their colour times their weight, a random number for each pixel of the screen.
+    So two pictures have the same number by a chance of one in 2**64.
     """
     color = (view.image.astype(np.uint64) @ np.array([1 << 16, 1 << 8, 1], np.uint64) + 1) * view.solid
     # Along a row of equal pixels the sum is the difference of two partial sums, so that only edges count.
     edges = -np.diff(color, axis=2, prepend=np.uint64(0), append=np.uint64(0))  # (FACINGS, W, W + 1)
     width = color.shape[1]
-    place = np.random.default_rng(0).integers(0, 1 << 64, (SCREEN, SCREEN), np.uint64) * view.free
+    weights = np.random.default_rng(0).integers(0, 1 << 64, (SCREEN, SCREEN), np.uint64) * view.free
     before = PAD + width // 2
-    place = np.pad(place, (before, width + SPAN - before - SCREEN))
-    sums = np.pad(np.cumsum(place, axis=1), ((0, 0), (1, 0)))
+    weights = np.pad(weights, (before, width + SPAN - before - SCREEN))
+    sums = np.pad(np.cumsum(weights, axis=1), ((0, 0), (1, 0)))
     rows, columns = view.rows, view.columns
     hashes = np.zeros((FACINGS, len(rows), len(columns)), np.uint64)
     for facing, row, column in np.argwhere(edges):
@@ -119,7 +119,7 @@ class VectorTables(NamedTuple):
 
     def write_agents(self, out: np.ndarray, sprite: np.ndarray, pos: np.ndarray) -> None:
         """Writes the entries of the agents with these sprites (n,) at these positions (n, 2) to out, (n, V)."""
-        codes = self.appearance.codes.take(sprite * (SPAN * SPAN) + pos.dot(PLACE_STRIDES), axis=0)  # (n, 4)
+        codes = self.appearance.codes.take(sprite * (SPAN * SPAN) + pos.dot(POSITION_STRIDES), axis=0)  # (n, 4)
         out[:, :3] = VALUES.take(codes[:, :3])
         out[:, 3 : 3 + FACINGS] = FLAGS.take(codes[:, 3], axis=0)
 

@@ -352,10 +352,10 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         try:
             self._check_state(state)
             settings = [self.complete_options(each) for each in state["settings"]]
-            arrays, kept = restored(state["arrays"]), {name: restored(state[name]) for name in self.kept}
+            arrays, rest = restored(state["arrays"]), {name: restored(state[name]) for name in self.kept}
         except (AttributeError, KeyError, TypeError) as error:
             raise ValueError(f"this is no state of {self.variant_id}: {brief(error)}") from None
-        super().set_state({**kept, "settings": settings})
+        super().set_state({**rest, "settings": settings})
         self.configure(np.arange(self.num_envs))  # for what follows from the options of all lanes
         self.state = type(self.state)(**arrays)
         self.place_tables()

@@ -1,8 +1,9 @@
-"""Shapes at any place of a frame as bits: laid over each other, counted, and turned into pixels.
+"""Shapes at any position in a frame as bits: laid over each other, counted, and turned into pixels.
 
 Bits come in two kinds. A mask has one for every pixel: 84 rows of 7 items, an item being 12 neighbouring pixels,
-(84, 7) uint16. A sample has one for every third pixel: every second row, and 8 of 12 neighbouring pixels as a byte,
-(42,) uint64. The lowest bit is the leftmost pixel. Shape letters: K shapes, n frames.
+(84, 7) uint16. A subsample has one for every third pixel: every second row, and 8 of 12 neighbouring pixels as a byte,
+(42,) uint64. The lowest bit is the leftmost pixel. Shape letters: K shapes, n frames, U
+uint64s of a mask or of a subsample.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,19 +18,19 @@ ITEM = 12
 ITEMS = SCREEN // ITEM
 TILES = SCREEN // 12
 MASK = SCREEN * ITEMS  # items of a mask
-SAMPLE_STEP = 2
-SAMPLE_ROWS = SCREEN // SAMPLE_STEP  # words of a sample
+ROW_STEP = 2
+SUBSAMPLE_ROWS = SCREEN // ROW_STEP  # rows of a subsample
 FULL_ROW = np.uint64((1 << 8 * ITEMS) - 1)  # all bits of one
-SAMPLED = np.array([0, 1, 3, 4, 6, 7, 9, 10])  # which of 12 pixels are
-PLACES, PLACE_0 = 256, 64  # shapes are at -64 .. 191 on both axes
+SUBSAMPLE_COLUMNS = np.array([0, 1, 3, 4, 6, 7, 9, 10])  # which of 12 pixels are
+POSITIONS, POSITION_0 = 256, 64  # shapes are at -64 .. 191 on both axes
 NO_SHAPE = np.zeros((0, 0), bool)
 
 
 class Stencils(NamedTuple):
-    """Square shapes at every place, which is the corner of their four middle pixels.
+    """Square shapes at every position, which is the corner of their four middle pixels.
 
     A picture of one is a window on a long strip, on which it stands between dark rows, once for every x. The arrays
-    (K * PLACES,) are looked up by shape * PLACES + PLACE_0 + x, or y.
+    (K * POSITIONS,) are looked up by shape * POSITIONS + POSITION_0 + x, or y.
     """
 
     windows: np.ndarray  # (rows,) by their first row on the strip: one opaque item each
@@ -37,7 +38,7 @@ class Stencils(NamedTuple):
     row: np.ndarray  # how far from there the window starts, for every y
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """The pictures at these keys, (...), as 64-bit words: (..., words) uint64."""
+        """The pictures at these keys, (...): (..., U) uint64."""
         pictures = self.windows[self.column.take(x) + self.row.take(y)]
         return pictures.view(np.uint64).reshape(*pictures.shape, pictures.itemsize // 8)
 
@@ -47,16 +48,16 @@ def stencils(shapes: Sequence[np.ndarray], height: int = SCREEN) -> Stencils:
     return _stencils(shapes, _packed, 1, height)
 
 
-def samples(shapes: Sequence[np.ndarray]) -> Stencils:
-    """Samples of (W, W) shapes, W even."""
-    return _stencils(shapes, _sampled, SAMPLE_STEP, SAMPLE_ROWS)
+def subsample_stencils(shapes: Sequence[np.ndarray]) -> Stencils:
+    """Subsamples of (W, W) shapes, W even."""
+    return _stencils(shapes, _packed_subsample, ROW_STEP, SUBSAMPLE_ROWS)
 
 
 def _stencils(shapes: Sequence[np.ndarray], pack: Callable, step: int, height: int) -> Stencils:
-    places = np.arange(PLACES) - PLACE_0
+    positions = np.arange(POSITIONS) - POSITION_0
     width = np.array([len(shape) for shape in shapes])[:, None]  # (K, 1)
-    first = places - width // 2  # (K, PLACES) the shape's first row or column
-    # A sample has every second row of a shape, these or those: every x has a part of the strip for either.
+    first = positions - width // 2  # (K, POSITIONS) the shape's first row or column
+    # A subsample has every second row of a shape, these or those: every x has a part of the strip for either.
     part, phase = width // step + height, -first % step
     row = (-first // step).clip(-height, width // step) + part * phase
     column, end = np.full(first.shape, height), 2 * height + step * int(part.max())
@@ -89,18 +90,18 @@ def unpacked(items: np.ndarray) -> np.ndarray:
     return (items[..., None] >> np.arange(ITEM, dtype=np.uint16) & 1).astype(bool).reshape(*items.shape[:-1], SCREEN)
 
 
-def sample(pixels: np.ndarray) -> np.ndarray:
-    """The sample of a frame's pixels (84, 84) bool: (42,) uint64."""
-    return _sampled(pixels[::SAMPLE_STEP])[:, 0]
+def subsample(pixels: np.ndarray) -> np.ndarray:
+    """The subsample of a frame's pixels (84, 84) bool: (42,) uint64."""
+    return _packed_subsample(pixels[::ROW_STEP])[:, 0]
 
 
-def _sampled(pixels: np.ndarray) -> np.ndarray:
-    """Rows of pixels (..., 84) bool as words (..., 1) uint64."""
-    eights = pixels.reshape(*pixels.shape[:-1], ITEMS, ITEM)[..., SAMPLED]
+def _packed_subsample(pixels: np.ndarray) -> np.ndarray:
+    """Rows of pixels (..., 84) bool as one number each, (..., 1) uint64."""
+    eights = pixels.reshape(*pixels.shape[:-1], ITEMS, ITEM)[..., SUBSAMPLE_COLUMNS]
     lines = np.packbits(eights, axis=-1, bitorder="little")[..., 0]  # (..., 7)
-    words_ = np.zeros((*lines.shape[:-1], 8), np.uint8)
-    words_[..., :ITEMS] = lines
-    return words_.view(np.uint64)
+    rows = np.zeros((*lines.shape[:-1], 8), np.uint8)
+    rows[..., :ITEMS] = lines
+    return rows.view(np.uint64)
 
 
 def row_windows(strip: np.ndarray, height: int) -> np.ndarray:
@@ -140,15 +141,15 @@ def bit_counts(numbers: np.ndarray) -> np.ndarray:
 
 
 def tile_counts(lines: np.ndarray) -> np.ndarray:
-    """Bits of samples, (n, 42) uint64, in each tile of 12 x 12 pixels, at most 48: (n, 49) uint8."""
+    """Bits of subsamples, (n, 42) uint64, in each tile of 12 x 12 pixels, at most 48: (n, 49) uint8."""
     counts = bit_counts(lines.view(np.uint8)).view(np.uint64).reshape(len(lines), TILES, -1)
     sums_ = np.einsum("njr->nj", counts).view(np.uint8).reshape(len(lines), TILES, 8)
     return sums_[..., :TILES].reshape(len(lines), -1)
 
 
-_X, _Y = (ITEM * np.arange(ITEMS)[:, None] + SAMPLED).reshape(-1), SAMPLE_STEP * np.arange(SAMPLE_ROWS)
+_X, _Y = (ITEM * np.arange(ITEMS)[:, None] + SUBSAMPLE_COLUMNS).reshape(-1), ROW_STEP * np.arange(SUBSAMPLE_ROWS)
 _DIGITS = SCREEN.bit_length()  # of an x
-# A word's pixels whose x has this binary digit; first all of them: (1 + _DIGITS, 1) uint64.
+# A row's pixels whose x has this binary digit; first all of them: (1 + _DIGITS, 1) uint64.
 _PLANES = np.stack(
     [FULL_ROW]
     + [
@@ -157,13 +158,13 @@ _PLANES = np.stack(
     ]
 )[:, None]
 # (8 * 42, 3) float32: what their counts add to the number of pixels and to the sums of x and of y.
-_MOMENTS: np.ndarray = np.zeros((1 + _DIGITS, SAMPLE_ROWS, 3), np.float32)
-_MOMENTS[0] = np.stack([np.ones(SAMPLE_ROWS), np.full(SAMPLE_ROWS, 0.5), _Y + 0.5], axis=1)
+_MOMENTS: np.ndarray = np.zeros((1 + _DIGITS, SUBSAMPLE_ROWS, 3), np.float32)
+_MOMENTS[0] = np.stack([np.ones(SUBSAMPLE_ROWS), np.full(SUBSAMPLE_ROWS, 0.5), _Y + 0.5], axis=1)
 _MOMENTS[1:, :, 1] = 1 << np.arange(_DIGITS)[:, None]
 _MOMENTS = _MOMENTS.reshape(-1, 3)
 
 
 def sums(lines: np.ndarray) -> np.ndarray:
-    """How many bits of samples, (n, 42) uint64, are set, and the sums of their pixels' x and y: (n, 3) float32."""
+    """How many bits of subsamples, (n, 42) uint64, are set, and the sums of their pixels' x and y: (n, 3) float32."""
     counts = bit_counts(lines[:, None] & _PLANES)  # (n, 8, 42)
     return counts.reshape(len(lines), len(_MOMENTS)).astype(np.float32) @ _MOMENTS

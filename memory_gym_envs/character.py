@@ -1,6 +1,6 @@
 """The agent's figure, shared by the families: how an action moves and turns it, and what it looks like.
 
-Positions are pixels along one axis, stored with PAD added so that a place beyond the screen's edge is still an index.
+Positions are pixels along one axis, stored with PAD added so that one beyond the screen's edge is still an index.
 Facings count eighths of a turn, counter-clockwise from up: 0 up, 1 up-left, 2 left, ... 7 up-right.
 """
 
@@ -108,7 +108,7 @@ def sprites(scale: float) -> tuple[np.ndarray, np.ndarray]:
     body = disk(width, middle, middle, radius)
     image[:, body], solid[:, body] = BODY, True
     for facing in range(FACINGS):
-        for x, y in hand_places(scale, facing):
+        for x, y in hand_offsets(scale, facing):
             palm = disk(width, middle + x, middle + y, hand)
             image[facing][palm] = HAND
             # A line of no width fills the circle: small hands are dark all over.
@@ -119,7 +119,7 @@ def sprites(scale: float) -> tuple[np.ndarray, np.ndarray]:
     return image[:, inner, inner], solid[:, inner, inner]
 
 
-def hand_places(scale: float, facing: int) -> list[tuple[int, int]]:
+def hand_offsets(scale: float, facing: int) -> list[tuple[int, int]]:
     """Where the two hands are, in whole pixels from the body's centre."""
     across = 2 * radius_of(scale) + int(10 * scale)
     centre = (across + 14) // 2  # from the corner of the original's sprite, where its rounding starts

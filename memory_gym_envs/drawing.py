@@ -82,10 +82,10 @@ def tile_picture(width: int, inside: tuple[int, int, int], edge: tuple[int, int,
 
 
 class Sheet(NamedTuple):
-    """Sprites ready to be pasted at any place of a frame, cut off at the screen's edges.
+    """Sprites ready to be pasted at any position in a frame, cut off at the screen's edges.
 
     Each sprite lies in the middle of a transparent canvas. To paste one is to choose a W x W window of the frame that
-    stays on the screen, the window of the canvas that covers the same place, and to blend the two: frame & keep | ink.
+    stays on the screen, the window of the canvas that covers the same pixels, and to blend the two: frame & keep | ink.
     """
 
     row: np.dtype  # of one row of a window: W pixels as one opaque item, which NumPy copies twice as fast as bytes
@@ -101,7 +101,7 @@ class Sheet(NamedTuple):
 def make_sheet(sprites: np.ndarray, solid: np.ndarray, positions: np.ndarray) -> Sheet:
     """Prepares (R, W, W, 3) sprites, solid where the (R, W, W) mask says, for centres at the given positions.
 
-    positions: (P,) the place on the screen, in pixels along one axis, that each index of `pos` in `paste` stands for.
+    positions: (P,) in pixels along one axis of the screen, what each index of `pos` in `paste` stands for.
     A sprite's centre is the corner between its four central pixels.
     """
     count, width = solid.shape[:2]
@@ -140,9 +140,9 @@ def paste(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, o
             _paste_one(frames, sheet, rows[i], pos[i], i if owner is None else owner[i])
         return
     first = np.arange(0, len(frames) * SCREEN * SCREEN, SCREEN * SCREEN) if owner is None else owner * SCREEN * SCREEN
-    place = pos.dot(sheet.strides)  # (n,)
-    start = sheet.frame_start.take(place) + first
-    source = sheet.canvas_start.take(place) + rows * (sheet.canvas * sheet.canvas)
+    index = pos.dot(sheet.strides)  # (n,)
+    start = sheet.frame_start.take(index) + first
+    source = sheet.canvas_start.take(index) + rows * (sheet.canvas * sheet.canvas)
     squares = squares_of(frames, SCREEN, sheet.row)  # a square never leaves its frame, as frame_start is clipped
     patch = squares[start]  # (n, W) rows
     pixels = patch.view(np.uint8)  # (n, W * W * 3), the same memory
@@ -153,9 +153,9 @@ def paste(frames: np.ndarray, sheet: Sheet, rows: np.ndarray, pos: np.ndarray, o
 
 def _paste_one(frames: np.ndarray, sheet: Sheet, row: int, pos: np.ndarray, owner: int) -> None:
     """Pastes one sprite: the same as `paste`, in fewer calls."""
-    place = pos.dot(sheet.strides)
-    start = 3 * (sheet.frame_start[place] + owner * (SCREEN * SCREEN))
-    source = 3 * (sheet.canvas_start[place] + row * (sheet.canvas * sheet.canvas))
+    index = pos.dot(sheet.strides)
+    start = 3 * (sheet.frame_start[index] + owner * (SCREEN * SCREEN))
+    source = 3 * (sheet.canvas_start[index] + row * (sheet.canvas * sheet.canvas))
     square, pitch = (sheet.row.itemsize // 3, sheet.row.itemsize), (3 * sheet.canvas, 1)
     patch = np.ndarray(square, np.uint8, frames, start, (ROW, 1))
     keep, ink = (np.ndarray(square, np.uint8, canvas, source, pitch) for canvas in sheet.canvases)

@@ -45,7 +45,7 @@ class Option:
 
     @property
     def allowed(self) -> str:
-        """The allowed values in words."""
+        """The allowed values as text."""
         if self.kind == "bool":
             return "true or false"
         noun = {

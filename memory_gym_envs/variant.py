@@ -21,7 +21,7 @@ class Variant:
     endless: bool = False
 
 
-def present(rows: Iterable[tuple[bool, Row]]) -> tuple[Row, ...]:
+def applicable(rows: Iterable[tuple[bool, Row]]) -> tuple[Row, ...]:
     """The rows whose condition holds, in their order."""
     return tuple(row for condition, row in rows if condition)
 

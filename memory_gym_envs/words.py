@@ -1,6 +1,6 @@
 """Random integers faster than from NumPy's generator, and the same: it makes them of the words of its bit generator.
 
-A word has 32 bits. `words` draws one at a time, `WordBuffer` reads many ahead.
+A word has 32 bits. `word_source` draws one at a time, `WordBuffer` reads many ahead.
 """
 
 from collections.abc import Callable
@@ -15,25 +15,25 @@ PERCENT_AGAIN = {word for part in range(100) if (word := -(-part * WORDS // 100)
 EIGHTHS = bytes(byte >> 5 for byte in range(256))  # by a word's upper byte
 
 
-def words(rng: np.random.Generator) -> Callable[[], int]:
+def word_source(rng: np.random.Generator) -> Callable[[], int]:
     """A function that draws the generator's next word. Whoever calls it must keep the generator."""
     source = rng.bit_generator.ctypes
     return partial(source.next_uint32, source.state)
 
 
-def below(word: Callable[[], int], limit: int) -> int:
+def sample_below(next_word: Callable[[], int], limit: int) -> int:
     """What Generator.integers(0, limit) would draw, for a limit from 1 to 2**32 - 1 (Lemire's method)."""
     if limit == 1:
         return 0
-    product = word() * limit
+    product = next_word() * limit
     while product & LOW < limit and product & LOW < WORDS % limit:
-        product = word() * limit
+        product = next_word() * limit
     return product >> 32
 
 
-def pick(word: Callable[[], int], values: tuple[int, ...]) -> int:
+def pick(next_word: Callable[[], int], values: tuple[int, ...]) -> int:
     """What Generator.choice would draw of these values. It takes no word where there is but one."""
-    return values[below(word, len(values))]
+    return values[sample_below(next_word, len(values))]
 
 
 class WordBuffer:
@@ -50,13 +50,13 @@ class WordBuffer:
         if "has_uint32" not in self.state:
             raise ValueError(f"levels need a generator of 64-bit numbers, as PCG64, not {type(self.source).__name__}")
         self.used = 1 - self.state["has_uint32"]
-        kept = self.state["uinteger"].to_bytes(4, "little")  # as a machine of today keeps numbers
-        self.load(kept + self.source.random_raw((count + 1) // 2).tobytes())
+        leftover = self.state["uinteger"].to_bytes(4, "little")  # as a machine of today keeps numbers
+        self.load(leftover + self.source.random_raw((count + 1) // 2).tobytes())
 
     def load(self, data: bytes) -> None:
         """Takes over the words."""
         self.words = memoryview(data).cast("I")
-        self.eighths = data[3::4].translate(EIGHTHS)  # what below(buffer, 8) would make of each
+        self.eighths = data[3::4].translate(EIGHTHS)  # what sample_below(buffer, 8) would make of each
 
     def __call__(self) -> int:
         """The next word."""
@@ -67,7 +67,7 @@ class WordBuffer:
         """Those things that are hit: for each, a number below 100 is drawn, which must be below percent."""
         drawn = self.words[self.used : self.used + len(things)].tolist()
         if not PERCENT_AGAIN.isdisjoint(drawn):
-            return [thing for thing in things if below(self, 100) < percent]
+            return [thing for thing in things if sample_below(self, 100) < percent]
         self.used += len(things)
         limit = -(-percent * WORDS // 100)  # of the words that make such a number
         return [thing for thing, word in zip(things, drawn, strict=True) if word < limit]

@@ -24,7 +24,7 @@ from memory_gym_envs.options import brief, complete_options
 from memory_gym_envs.saving import Saved
 from memory_gym_envs.searing_spotlights import VARIANTS, SearingSpotlights
 from memory_gym_envs.searing_spotlights.drawing import light_masks, spot_stencils
-from memory_gym_envs.searing_spotlights.rules import spot_places
+from memory_gym_envs.searing_spotlights.rules import spot_positions
 from memory_gym_envs.searing_spotlights.state import SPEED, TIME
 
 OBSERVATION = "observation"  # the name of an observation that is no Dict, where it becomes a part of one
@@ -406,7 +406,7 @@ class SpotlightPerturbation(ImageWrapper):
         self._light.restart(lanes, [None] * self.num_envs, self._settings)
         s = self._light.state
         s.spots[TIME, lanes] = HEAD_START
-        s.spot_place[:, lanes] = spot_places(s.spots[:, lanes]).astype(np.int64) + s.spot_key[lanes]
+        s.spot_place[:, lanes] = spot_positions(s.spots[:, lanes]).astype(np.int64) + s.spot_key[lanes]
         s.spots[TIME, lanes] += s.spots[SPEED, lanes]
 
     def advance(self, observations: Any, actions: np.ndarray, rewards: np.ndarray) -> None:

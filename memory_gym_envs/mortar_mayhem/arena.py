@@ -44,8 +44,8 @@ class TileTables(NamedTuple):
 def tile_tables() -> TileTables:
     """The tables of all tiles."""
     numbers = {floor: number for number, floor in enumerate(FLOORS)}
-    places = [(size, *(tile or (0, 0))) for size, tile in FLOORS]
-    corner = [[first_pixel(size) + PAD + TILE * x, first_pixel(size) + PAD + TILE * y] for size, x, y in places]
-    truth = [[x / (size - 1), y / (size - 1)] for size, x, y in places]
-    ahead = [[numbers[size, ((x + dx) % size, (y + dy) % size)] for dx, dy in MOVES.tolist()] for size, x, y in places]
+    tiles = [(size, *(tile or (0, 0))) for size, tile in FLOORS]
+    corner = [[first_pixel(size) + PAD + TILE * x, first_pixel(size) + PAD + TILE * y] for size, x, y in tiles]
+    truth = [[x / (size - 1), y / (size - 1)] for size, x, y in tiles]
+    ahead = [[numbers[size, ((x + dx) % size, (y + dy) % size)] for dx, dy in MOVES.tolist()] for size, x, y in tiles]
     return TileTables(*(read_only(np.array(table)) for table in (corner, truth, ahead)))

@@ -16,7 +16,7 @@ from memory_gym_envs.mortar_mayhem.state import State
 from memory_gym_envs.mortar_mayhem.vectors import VectorTables
 from memory_gym_envs.state import Lanes, empty, make_room
 from memory_gym_envs.walking import WalkingVectorEnv
-from memory_gym_envs.words import below, words
+from memory_gym_envs.words import sample_below, word_source
 
 EVERY_LANE: Any = np.True_  # a mask for when no clue is shown, so that all lanes act
 
@@ -178,7 +178,7 @@ class MortarMayhem(WalkingVectorEnv):
             rewards[lanes], sequence_over = rules.ignite_tiles(s, lanes)
             if self.variant.endless:
                 for lane in lanes[sequence_over].tolist():
-                    command = below(words(self._rngs[lane]), self.settings[lane]["allowed_commands"])
+                    command = sample_below(word_source(self._rngs[lane]), self.settings[lane]["allowed_commands"])
                     rules.extend_sequence(s, lane, command)
                     self._clues_open = True
             else:

@@ -10,7 +10,7 @@ from memory_gym_envs.mortar_mayhem.arena import COMMANDS, MOVES, TILE, TORUS_SIZ
 from memory_gym_envs.mortar_mayhem.options import VECTOR_ORDER, MortarVariant
 from memory_gym_envs.mortar_mayhem.rules import set_target, write_clue
 from memory_gym_envs.mortar_mayhem.state import State
-from memory_gym_envs.words import below, pick, words
+from memory_gym_envs.words import pick, sample_below, word_source
 
 VECTOR_INDEX = [VECTOR_ORDER.index(command) for command in COMMANDS]
 
@@ -29,23 +29,24 @@ class Level(NamedTuple):
 
 def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: MortarVariant) -> Level:
     """Samples a level in the original's order, so that its seeds mean the same here."""
-    word = words(rng)
+    next_word = word_source(rng)
     size = TORUS_SIZE if variant.endless else values["arena_size"]
-    tile = below(word, size * size)
-    offset = (below(word, 4) - 2, below(word, 4) - 2) if variant.jitter else (0, 0)
+    tile = sample_below(next_word, size * size)
+    offset = (sample_below(next_word, 4) - 2, sample_below(next_word, 4) - 2) if variant.jitter else (0, 0)
     if variant.endless:
         kinds = values["allowed_commands"]
-        commands = [below(word, kinds) for _ in range(values["initial_command_count"])]
+        commands = [sample_below(next_word, kinds) for _ in range(values["initial_command_count"])]
     else:
-        commands = sample_walk(word, tile, pick(word, values["command_count"]), size, values["allowed_commands"])
-    show_duration = pick(word, values["command_show_duration"]) if variant.clue else 0
-    show_delay = pick(word, values["command_show_delay"]) if variant.clue else 0
-    explosion_duration = pick(word, values["explosion_duration"])
-    explosion_delay = pick(word, values["explosion_delay"])
+        count = pick(next_word, values["command_count"])
+        commands = sample_walk(next_word, tile, count, size, values["allowed_commands"])
+    show_duration = pick(next_word, values["command_show_duration"]) if variant.clue else 0
+    show_delay = pick(next_word, values["command_show_delay"]) if variant.clue else 0
+    explosion_duration = pick(next_word, values["explosion_duration"])
+    explosion_delay = pick(next_word, values["explosion_delay"])
     return Level(tile, offset, commands, show_duration, show_delay, explosion_duration, explosion_delay)
 
 
-def sample_walk(word: Callable[[], int], tile: int, count: int, size: int, kinds: int) -> list[int]:
+def sample_walk(next_word: Callable[[], int], tile: int, count: int, size: int, kinds: int) -> list[int]:
     """So many commands that lead from the tile through the arena without leaving it.
 
     tile: column * size + row. kinds: how many kinds of command may occur.
@@ -54,7 +55,7 @@ def sample_walk(word: Callable[[], int], tile: int, count: int, size: int, kinds
     commands = []
     for _ in range(count):
         valid = moves[tile]
-        command, tile = valid[below(word, len(valid))]
+        command, tile = valid[sample_below(next_word, len(valid))]
         commands.append(command)
     return commands
 

@@ -8,7 +8,7 @@ from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.entries import Entries
 from memory_gym_envs.mortar_mayhem.arena import ARENA_SIZES, COMMANDS
 from memory_gym_envs.options import Option
-from memory_gym_envs.variant import Variant, agent_scale, agent_speed, max_steps, present
+from memory_gym_envs.variant import Variant, agent_scale, agent_speed, applicable, max_steps
 
 VECTOR_ORDER = ("stay", "right", "left", "up", "down", "right_down", "right_up", "left_down", "left_up")
 VECTOR_COMMANDS = 20  # commands that the command vector has room for
@@ -51,7 +51,7 @@ def option_rows(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
         (not endless, Option("reward_episode_success", 0.0, "float", None, None, last_command)),
         (endless, Option("reward_new_command_success", 0.0, "float", None, None, new_command)),
     ]
-    return present(rows)
+    return applicable(rows)
 
 
 def entry_rows(clue: bool, endless: bool) -> tuple[Entries, ...]:

@@ -91,7 +91,7 @@ def camera_columns(values: dict[str, Any]) -> tuple[int, int]:
     return corner + int(radius - corner + camera) + PAD, math.floor(radius + camera + 0.5) + PAD
 
 
-def place_camera(s: State, lanes: np.ndarray, values: dict[str, Any]) -> None:
+def set_camera(s: State, lanes: np.ndarray, values: dict[str, Any]) -> None:
     """Writes what the endless id's options mean for the camera, and for what moves with it, to these lanes."""
     speed = int(values["agent_speed"])
     s.extras[lanes] |= values["agent_speed"] > FAST
@@ -104,7 +104,7 @@ def place_camera(s: State, lanes: np.ndarray, values: dict[str, Any]) -> None:
     s.cross_fits[lanes] = cross_x < PAD + SCREEN - STAMINA_BAR * values["show_stamina"] + CROSS // 2
 
 
-def place_on_screen(s: State, lanes: Lanes, endless: bool) -> np.ndarray:
+def positions_on_screen(s: State, lanes: Lanes, endless: bool) -> np.ndarray:
     """(n, 2) stored positions where the agents are drawn."""
     pos = s.pos[lanes]
     if endless:
@@ -196,7 +196,7 @@ def draw_trail(frames: np.ndarray, s: State, lanes: Lanes) -> None:
 
 def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: Lanes, endless: bool) -> None:
     """Draws the agents, their stamina and their crosses on the frames (n, FRAME), in place."""
-    pos, extras = place_on_screen(s, lanes, endless), endless and np.count_nonzero(s.extras[lanes])
+    pos, extras = positions_on_screen(s, lanes, endless), endless and np.count_nonzero(s.extras[lanes])
     paste(frames, sheet, s.figure[lanes] * FACINGS + s.facing[lanes], pos)
     if extras:
         shown = s.show_stamina[lanes]

@@ -54,7 +54,7 @@ class MysteryPath(WalkingVectorEnv):
 
     Terminated at the goal. The endless id: terminated when the agent has reached no new tile for `stamina_level` (20)
     steps (all tiles are new again after a fall), falls off in a column left of the rightmost one that it reached, or
-    falls off at the same place again. Truncated after `max_steps` steps (512, Grid 128, endless no limit), unless the
+    falls off at the same tile again. Truncated after `max_steps` steps (512, Grid 128, endless no limit), unless the
     same step terminates.
 
     ## Info
@@ -77,7 +77,7 @@ class MysteryPath(WalkingVectorEnv):
     - The Grid id ignores `agent_scale`, the endless id `show_origin`.
     - Steps are cut off to whole pixels, a diagonal one to 2 pixels at the default speed. In the endless id the camera's
       fraction of a pixel is cut off, and the background jumps at speeds that do not divide 12.
-    - In the endless id the places where the agent fell off count until the episode ends. Where the path goes left, the
+    - In the endless id the tiles where the agent fell off count until the episode ends. Where the path goes left, the
       agent cannot follow it.
     - Of the path's leftmost column that is shown behind the agent, only one tile is drawn, and nothing is drawn while
       the agent is in the first column.
@@ -103,7 +103,7 @@ class MysteryPath(WalkingVectorEnv):
         s.radius[lanes] = radius_of(self.scale_of(values))
         s.extras[lanes] = (s.show_origin | s.show_goal | s.show_ground | s.show_stamina)[lanes]
         if self.variant.endless:
-            drawing.place_camera(s, lanes, values)
+            drawing.set_camera(s, lanes, values)
 
     def figures_of(self, values: dict[str, Any]) -> tuple[Figure, ...]:
         """The agent's figure under these options."""
@@ -115,9 +115,9 @@ class MysteryPath(WalkingVectorEnv):
         every = [vectors.view_options_of(values, self.scale_of(values), endless) for values in self.settings]
         self.view_options, self.state.view[:] = numbered(every)
         super().place_tables()
-        self._place_lanes()
+        self._index_lanes()
 
-    def _place_lanes(self) -> None:
+    def _index_lanes(self) -> None:
         """Finds where each lane's cells and steps start in the flattened state."""
         self._lane_map = np.arange(self.num_envs) * self.state.step_at.shape[1] + PIT_ROWS  # (N,)
         self._lane_path = np.arange(self.num_envs) * self.state.path_cell.shape[1]  # (N,)
@@ -132,7 +132,7 @@ class MysteryPath(WalkingVectorEnv):
         for lane in lanes.tolist():
             level = levels.sample_level(self._rngs[lane], self.settings[lane], self.variant)
             if levels.write_level(self.state, lane, level, self.variant.endless):
-                self._place_lanes()
+                self._index_lanes()
 
     def apply_rules(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Walks, and enters a tile or falls off: rewards and terminations, (N,) each."""
@@ -166,7 +166,7 @@ class MysteryPath(WalkingVectorEnv):
             return
         for lane in np.flatnonzero(entered).tolist():
             if levels.append_segment(s, lane, self._rngs[lane]):
-                self._place_lanes()
+                self._index_lanes()
 
     def vectors(self, lanes: Lanes) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32."""
@@ -184,8 +184,8 @@ class MysteryPath(WalkingVectorEnv):
         """The lanes' ended episodes in numbers, each (n,)."""
         s, numbers = self.state, super().summary(lanes)
         if self.variant.endless:
-            places = {"max_x": s.max_column[lanes], "tiles_visited": s.visited[lanes]}
-            return numbers | {"num_fails": s.fails[lanes]} | places
+            numbers |= {"num_fails": s.fails[lanes]}
+            return numbers | {"max_x": s.max_column[lanes], "tiles_visited": s.visited[lanes]}
         success = s.path_step[lanes] == s.path_length[lanes]
         return numbers | {"success": success.astype(np.int64), "num_fails": s.fails[lanes], "is_success": success}
 

@@ -1,6 +1,7 @@
 """Mystery Path's levels: walls, a path around them, and the start of an episode on it.
 
-A level is sampled on grids of 7 x 7 places, one for each segment. A place is column * SIDE + row.
+A path is searched on a grid of 7 x 7 nodes for each segment. A node is a number, column * SIDE + row; the map's cells
+of state.py have other numbers.
 """
 
 import math
@@ -23,38 +24,37 @@ from memory_gym_envs.mystery_path.state import (
     make_path_room,
 )
 from memory_gym_envs.variant import Variant
-from memory_gym_envs.words import WordBuffer, below, pick
+from memory_gym_envs.words import WordBuffer, pick, sample_below
 
 FIRST_SEGMENTS = 3  # of an endless path; another is appended whenever the agent enters the last one
 
-PLACES = [divmod(place, SIDE) for place in range(SIDE * SIDE)]
-CELLS = [column * ROWS + PIT_ROWS + row for column, row in PLACES]
+NODES = [divmod(node, SIDE) for node in range(SIDE * SIDE)]  # column and row of each
+CELLS = [column * ROWS + PIT_ROWS + row for column, row in NODES]
 STRAIGHT = ((1, 0), (-1, 0), (0, 1), (0, -1))  # in the original's order
 OBLIQUE = ((1, 1), (-1, -1), (1, -1), (-1, 1))
 
 
 def _neighbours(x: int, y: int, moves: tuple[tuple[int, int], ...]) -> list[int]:
-    spots = [(x + dx, y + dy) for dx, dy in moves]
-    return [spot[0] * SIDE + spot[1] for spot in spots if spot in PLACES]
+    return [NODES.index((x + dx, y + dy)) for dx, dy in moves if (x + dx, y + dy) in NODES]
 
 
-NEIGHBOURS = [_neighbours(x, y, STRAIGHT) for x, y in PLACES]
-DISTANCES = [[math.sqrt((a - x) ** 2 + (b - y) ** 2) for a, b in PLACES] for x, y in PLACES]
+NEIGHBOURS = [_neighbours(x, y, STRAIGHT) for x, y in NODES]
+DISTANCES = [[math.sqrt((a - x) ** 2 + (b - y) ** 2) for a, b in NODES] for x, y in NODES]
 
-# Places that may become walls. A set of border places is an integer, with a bit for each of the 24.
-INSIDE = [place for place, (x, y) in enumerate(PLACES) if 0 < x < SIDE - 2 and 0 < y < SIDE - 2]
-BORDER = [place for place, spot in enumerate(PLACES) if 0 in spot or SIDE - 1 in spot]
-
-
-def _border_bits(places: list[int]) -> int:
-    return sum(1 << at for at, place in enumerate(BORDER) if place in places)
+# Nodes that may become walls. A set of border nodes is an integer, with a bit for each of the 24.
+INSIDE = [node for node, (x, y) in enumerate(NODES) if 0 < x < SIDE - 2 and 0 < y < SIDE - 2]
+BORDER = [node for node, tile in enumerate(NODES) if 0 in tile or SIDE - 1 in tile]
 
 
-# Border places that stay free because of a place: at most a step away from a start or end, next to or at the corners of
+def _border_bits(nodes: list[int]) -> int:
+    return sum(1 << at for at, node in enumerate(BORDER) if node in nodes)
+
+
+# Border nodes that stay free because of a node: at most a step away from a start or end, next to or at the corners of
 # a wall.
-NEAR_END = [_border_bits(_neighbours(x, y, ((0, 0), *STRAIGHT))) for x, y in PLACES]
-AROUND_WALL = [_border_bits(_neighbours(x, y, STRAIGHT + OBLIQUE)) for x, y in PLACES]
-# CANDIDATES[i][bits]: those of the border's places 8 * i to 8 * i + 7 that may become walls while the set bits may not.
+NEAR_END = [_border_bits(_neighbours(x, y, ((0, 0), *STRAIGHT))) for x, y in NODES]
+AROUND_WALL = [_border_bits(_neighbours(x, y, STRAIGHT + OBLIQUE)) for x, y in NODES]
+# CANDIDATES[i][bits]: those of the border's nodes 8 * i to 8 * i + 7 that may become walls while the set bits may not.
 CANDIDATES = [
     [[BORDER[first + at] for at in range(8) if not bits >> at & 1] for bits in range(256)] for first in (0, 8, 16)
 ]
@@ -72,7 +72,7 @@ class Level(NamedTuple):
     """What the generator decides at a reset, and for every further segment of an endless path."""
 
     path: list[int]  # its cells, from the origin to the goal
-    walls: list[list[int]]  # the places of each segment that the path avoids
+    walls: list[list[int]]  # the nodes of each segment that the path avoids
 
 
 def read_ahead(rng: np.random.Generator, paths: int) -> WordBuffer:
@@ -84,10 +84,10 @@ def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Vari
     """Samples a level. It draws in the original's order, so that a seed builds the same level."""
     buffer = read_ahead(rng, FIRST_SEGMENTS if variant.endless else 1)
     if variant.endless:
-        level = sample_segments(buffer, below(buffer, SIDE), 0, FIRST_SEGMENTS)
+        level = sample_segments(buffer, sample_below(buffer, SIDE), 0, FIRST_SEGMENTS)
     else:
         side = pick(buffer, values["cardinal_origin_choice"])
-        start, end = below(buffer, SIDE), below(buffer, SIDE)
+        start, end = sample_below(buffer, SIDE), sample_below(buffer, SIDE)
         near, far = (0, SIDE - 1) if side in (0, 2) else (SIDE - 1, 0)
         if side in (0, 1):
             start, end = near * SIDE + start, far * SIDE + end
@@ -103,7 +103,7 @@ def sample_segments(buffer: WordBuffer, row: int, first: int, count: int) -> Lev
     """Samples `count` segments of an endless path, which starts in this row of segment number `first`."""
     path, every_wall = [], []
     for segment in range(first, first + count):
-        start, end = row, (SIDE - 1) * SIDE + below(buffer, SIDE)
+        start, end = row, (SIDE - 1) * SIDE + sample_below(buffer, SIDE)
         walls = sample_walls(buffer, start, end)
         path += cells_of(sample_path(buffer, walls, start, end), segment)
         path.append(path[-1] + ROWS)  # the transition tile
@@ -113,39 +113,39 @@ def sample_segments(buffer: WordBuffer, row: int, first: int, count: int) -> Lev
 
 
 def sample_walls(buffer: WordBuffer, start: int, end: int) -> list[int]:
-    """The places that the path avoids: some inside, and some on the border that touch neither those nor start and end.
+    """The nodes that the path avoids: some inside, and some on the border that touch neither those nor start and end.
 
     So there always is a path: along the border, and one ring further inside past the walls of the border.
     """
-    walls, kept_free = buffer.sample_each(INSIDE, WALL_PERCENT), NEAR_END[start] | NEAR_END[end]
-    for place in walls:
-        kept_free |= AROUND_WALL[place]
-    border = CANDIDATES[0][kept_free & 255] + CANDIDATES[1][kept_free >> 8 & 255] + CANDIDATES[2][kept_free >> 16]
-    return walls + buffer.take_random(border, BORDER_WALLS[below(buffer, 2)])
+    walls, reserved = buffer.sample_each(INSIDE, WALL_PERCENT), NEAR_END[start] | NEAR_END[end]
+    for node in walls:
+        reserved |= AROUND_WALL[node]
+    border = CANDIDATES[0][reserved & 255] + CANDIDATES[1][reserved >> 8 & 255] + CANDIDATES[2][reserved >> 16]
+    return walls + buffer.take_random(border, BORDER_WALLS[sample_below(buffer, 2)])
 
 
 def sample_path(buffer: WordBuffer, walls: list[int], start: int, end: int) -> list[int]:
-    """The path that A* finds over random costs, not always the cheapest: its places from start to end."""
+    """The path that A* finds over random costs, not always the cheapest: its nodes from start to end."""
     costs, used, distance = buffer.eighths, buffer.used, DISTANCES[end]
     cost, total, previous = [UNREACHED] * (SIDE * SIDE), [0.0] * (SIDE * SIDE), [start] * (SIDE * SIDE)
-    for place in walls:
-        cost[place] = CLOSED
+    for node in walls:
+        cost[node] = CLOSED
     opened, first, here, so_far = [], None, start, 1
     while here != end:
         cost[here] = CLOSED
-        for place in NEIGHBOURS[here]:
-            if cost[place]:
+        for node in NEIGHBOURS[here]:
+            if cost[node]:
                 there = so_far + costs[used]  # a cost of 1 to 8
                 used += 1
-                if cost[place] == UNREACHED:
-                    cost[place], total[place], previous[place] = there, there + distance[place], here
-                    opened.append(place)
-                elif there < cost[place]:
+                if cost[node] == UNREACHED:
+                    cost[node], total[node], previous[node] = there, there + distance[node], here
+                    opened.append(node)
+                elif there < cost[node]:
                     # The original leaves the higher cost as it is.
-                    previous[place] = here
-        # As in the original, the next place is not the one of the least total. It is the first one in the queue whose
+                    previous[node] = here
+        # As in the original, the next node is not the one of the least total. It is the first one in the queue whose
         # total is below that of the queue's first, or else the queue's first itself. So while that stays first, the
-        # places that were passed over need no second comparison.
+        # nodes that were passed over need no second comparison.
         if first is None:
             waiting, passed = iter(opened), []
             first = next(waiting)
@@ -162,17 +162,17 @@ def sample_path(buffer: WordBuffer, walls: list[int], start: int, end: int) -> l
 
 
 def trace_back(previous: list[int], start: int, end: int) -> list[int]:
-    """The places from start to end, where previous[place] is the place before each."""
+    """The nodes from start to end, where previous[node] is the node before each."""
     path = [end]
     while path[-1] != start:
         path.append(previous[path[-1]])
     return path[::-1]
 
 
-def cells_of(places: list[int], segment: int) -> list[int]:
-    """The map's cells of this segment's places."""
+def cells_of(nodes: list[int], segment: int) -> list[int]:
+    """The map's cells of this segment's nodes."""
     shift = segment * SEGMENT * ROWS
-    return [CELLS[place] + shift for place in places]
+    return [CELLS[node] + shift for node in nodes]
 
 
 def write_level(s: State, lane: int, level: Level, endless: bool) -> bool:

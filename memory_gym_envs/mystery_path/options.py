@@ -5,7 +5,7 @@ from memory_gym_envs.character import LARGEST_RADIUS, PAD, SPAN
 from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.entries import Entries
 from memory_gym_envs.options import Option
-from memory_gym_envs.variant import Variant, agent_scale, agent_speed, max_steps, present
+from memory_gym_envs.variant import Variant, agent_scale, agent_speed, applicable, max_steps
 
 TILE = 12  # pixels
 SIDE = 7  # tiles along one side of the screen, and of a segment of the endless path
@@ -43,18 +43,18 @@ def option_rows(grid: bool, endless: bool) -> tuple[Option, ...]:
         (endless, Option("reward_path_progress_dense", 0.0, "float", None, None, dense)),
         (True, Option("reward_step", 0.0, "float", None, None, "reward for every step")),
     ]
-    return present(rows)
+    return applicable(rows)
 
 
 def entry_rows(endless: bool) -> tuple[Entries, ...]:
     """The entries of an id's vector observation."""
     cross = Entries("cross", 1, "1: a red cross is visible, where the agent fell off")
     if not endless:
-        places = [
+        ends = [
             Entries(name, 2, f"the centre of the path's {name}, x and y, / 84 pixels; zeros: not shown, or hidden")
             for name in ("origin", "goal")
         ]
-        return *agent_entries(0, SCREEN + LARGEST_RADIUS), cross, *places
+        return *agent_entries(0, SCREEN + LARGEST_RADIUS), cross, *ends
     past = (
         "1: a tile of the path behind the agent is visible; by column and then row: 7 rows, and 8 columns of 12 pixels "
         "for the tile's left edge, the first of them left of the screen"

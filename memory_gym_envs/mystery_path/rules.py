@@ -64,7 +64,7 @@ def enter_tiles(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: b
 def spend_stamina(s: State, cell: np.ndarray, landed: int) -> np.ndarray:
     """The endless id: which episodes end, for lack of stamina or by a fall, (N,) bool.
 
-    cell: (N,) the agents' places in the flattened map. landed: how many agents entered a tile.
+    cell: (N,) the agents' cells in the flattened map. landed: how many agents entered a tile.
     """
     if not landed:
         s.stamina -= 1
@@ -78,7 +78,7 @@ def spend_stamina(s: State, cell: np.ndarray, landed: int) -> np.ndarray:
 def fatal_falls(s: State, cell: np.ndarray) -> np.ndarray:
     """The endless id: which agents fell off where that ends the episode, (N,) bool.
 
-    cell: (N,) the agents' places in the flattened map.
+    cell: (N,) the agents' cells in the flattened map.
     """
     over = s.fallen & ((s.tile[:, 0] < s.max_column) | s.fell_at.take(cell))
     # These are kept for the whole episode. The original would clear them on progress, but compares too early.

@@ -72,7 +72,7 @@ def with_cross(image: np.ndarray, solid: np.ndarray, aside: int) -> tuple[np.nda
 
 def make_vectors(s: State, tables: VectorTables, lanes: Lanes, endless: bool) -> np.ndarray:
     """Fresh vector observations of the lanes, (n, V) float32."""
-    at, shows_cross, pos = tables.at, s.shows_cross[lanes], drawing.place_on_screen(s, lanes, endless)
+    at, shows_cross, pos = tables.at, s.shows_cross[lanes], drawing.positions_on_screen(s, lanes, endless)
     sprite = tables.lane_sprite[lanes] + shows_cross * FACINGS + s.facing[lanes]  # (n,)
     out = np.zeros((len(sprite), tables.width), np.float32)
     tables.write_agents(out, sprite, pos)

@@ -1,6 +1,6 @@
 """Frames, and the tables of pictures that they are made of.
 
-Shape letters: N lanes, n some of them, S spotlights that fit, R sprites, W a sprite's width.
+Shape letters: N lanes, n some of them, S spotlights that fit, R sprites, W a sprite's width, U uint64s.
 """
 
 from functools import cache, lru_cache
@@ -76,7 +76,7 @@ def bars(endless: bool) -> np.ndarray:
 
 
 class SpotStencils(NamedTuple):
-    """Every spotlight at every place, by its radius."""
+    """Every spotlight at every position, by its radius."""
 
     disks: Stencils
     rims: Stencils  # their outlines
@@ -161,9 +161,9 @@ def _arch(size: int, corner: int) -> np.ndarray:
 def set_pictures(s: State, lanes: np.ndarray, values: dict[str, Any]) -> None:
     """Writes what the options mean for the pictures to the state of these lanes, (n,)."""
     coins, exit_, agent = values["coins_visible"], values.get("exit_visible", False), values["agent_visible"]
-    plain = WHITE_FLOOR if values["hide_chessboard"] else BLUE_FLOOR
-    alarm = RED_FLOOR if plain == BLUE_FLOOR and values["visual_feedback"] else plain
-    s.floors[lanes] = BLACK_FLOOR if values["black_background"] else (plain, alarm)
+    calm = WHITE_FLOOR if values["hide_chessboard"] else BLUE_FLOOR
+    alarm = RED_FLOOR if calm == BLUE_FLOOR and values["visual_feedback"] else calm
+    s.floors[lanes] = BLACK_FLOOR if values["black_background"] else (calm, alarm)
     s.darkness[lanes] = opacity = fading(values["light_dim_off_duration"], values["light_threshold"])
     # Rims are blended like dimmed pixels, so with rims the darkness is never just black.
     opaque = np.flatnonzero(opacity == 255)
@@ -285,9 +285,9 @@ def light_masks(s: State, tables: SpotStencils, lanes: Lanes) -> tuple[np.ndarra
 def overlay(
     disks: np.ndarray, rims: Stencils, key: np.ndarray, rimmed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Overlays the spotlights: what they light, and their visible rims (None: no lane has rims), (n, words) each.
+    """Overlays the spotlights: what they light, and their visible rims (None: no lane has rims), (n, U) each.
 
-    disks: (S, n, words) each alone. rims, key: the table of rims, and their keys in it, (2, S, n).
+    disks: (S, n, U) each alone. rims, key: the table of rims, and their keys in it, (2, S, n).
     rimmed: (n,) bool: the lane's spotlights have rims.
     """
     lit = np.bitwise_or.reduce(disks, axis=0)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from memory_gym_envs.base import DEBUG_ZOOM, NO_LIMIT
-from memory_gym_envs.bits import PLACE_0, PLACES, pixel_scratch
+from memory_gym_envs.bits import POSITION_0, POSITIONS, pixel_scratch
 from memory_gym_envs.character import PAD, Figure
 from memory_gym_envs.drawing import GREEN, SCREEN, magnify, ring
 from memory_gym_envs.searing_spotlights import drawing, levels, rules, vectors
@@ -14,7 +14,7 @@ from memory_gym_envs.searing_spotlights.options import VARIANTS
 from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, RADIUS, State
 from memory_gym_envs.state import Lanes, empty, make_room
 from memory_gym_envs.walking import WalkingVectorEnv, numbered
-from memory_gym_envs.words import words
+from memory_gym_envs.words import word_source
 
 
 class SearingSpotlights(WalkingVectorEnv):
@@ -205,8 +205,8 @@ class SearingSpotlights(WalkingVectorEnv):
                 shown[lane] = float(rewards[lane])
             rewards[lane] += s.reward_coin[lane] * rules.take_coins(s, lane, touched[lane])
             if self.variant.endless:
-                place = levels.sample_coin(words(self._rngs[lane]), last)
-                rules.place_coin(s, lane, place, rules.coin_show_limit(values, first=False))
+                coin = levels.sample_coin(word_source(self._rngs[lane]), last)
+                rules.put_coin(s, lane, coin, rules.coin_show_limit(values, first=False))
             self._draw_scenery(lane)
         return shown
 
@@ -253,11 +253,11 @@ class SearingSpotlights(WalkingVectorEnv):
         (N,); `health` (N,); in the finite id `exit` (N, 2), NaN where there is none, and `exit_is_open` (N,) bool.
         """
         s = self.state
-        places = np.where(s.bodies == GONE, np.nan, s.bodies).transpose(1, 2, 0)  # (N, B, 2)
-        numbers = super().oracle() | {"coins": places[:, COIN:], "coins_left": s.coins_left.copy()}
+        positions = np.where(s.bodies == GONE, np.nan, s.bodies).transpose(1, 2, 0)  # (N, B, 2)
+        numbers = super().oracle() | {"coins": positions[:, COIN:], "coins_left": s.coins_left.copy()}
         numbers |= {"coins_collected": s.collected.copy(), "health": s.health.copy()}
         if not self.variant.endless:
-            numbers |= {"exit": places[:, EXIT], "exit_is_open": s.is_open == 1}
+            numbers |= {"exit": positions[:, EXIT], "exit_is_open": s.is_open == 1}
         return numbers
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
@@ -268,7 +268,7 @@ class SearingSpotlights(WalkingVectorEnv):
         frame[below] = magnify(lit.reshape(SCREEN, SCREEN, 3), DEBUG_ZOOM)[below]
         for slot in np.flatnonzero(s.spot_place[0, lane]).tolist():
             radius = int(s.spots[RADIUS, lane, slot])
-            x, y = (s.spot_place[:, lane, slot] - radius * PLACES - PLACE_0).tolist()
+            x, y = (s.spot_place[:, lane, slot] - radius * POSITIONS - POSITION_0).tolist()
             circle = ring(len(frame), x * DEBUG_ZOOM, y * DEBUG_ZOOM, radius * DEBUG_ZOOM, DEBUG_ZOOM)
             circle[: TOP_BAR * DEBUG_ZOOM] = False
             frame[circle] = GREEN

@@ -10,68 +10,70 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memory_gym_envs.bits import PLACE_0, PLACES
-from memory_gym_envs.character import FACINGS, PAD, hand_places, radius_of
+from memory_gym_envs.bits import POSITION_0, POSITIONS
+from memory_gym_envs.character import FACINGS, PAD, hand_offsets, radius_of
 from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.searing_spotlights.rules import start_wait, update_targets
 from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, NO_KEY, NO_SPOT, RADIUS, State
 from memory_gym_envs.state import make_room
 from memory_gym_envs.variant import Variant
-from memory_gym_envs.words import below, pick, words
+from memory_gym_envs.words import pick, sample_below, word_source
 
 MIDDLE = SCREEN // 2
 OUTSIDE = math.sqrt(2 * SCREEN**2) / 2  # spotlights start and end that far from the middle, and their radius more
 MARGIN = 7  # coins and the exit stay that far from the screen's edges
-AGENT_SPACE, COIN_SPACE = 28, 21  # pixels around a place where nothing else is put
+AGENT_SPACE, COIN_SPACE = 28, 21  # pixels around a position where nothing else is put
+
+Position = tuple[int, int]  # x and y in pixels
 
 
 class Level(NamedTuple):
-    """A level. Places are x and y in pixels."""
+    """What the generator decides at a reset."""
 
     facing: int
-    pos: tuple[int, int]  # the agent's
+    pos: Position  # the agent's
     spots: list[list[float]]  # each a column of State.spots
-    coins: list[tuple[int, int]]
-    exit: tuple[int, int] | None
+    coins: list[Position]
+    exit: Position | None
     delay: int  # steps added to the first interval between spotlights
 
 
 def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
     """Samples a level of the given options."""
-    word = words(rng)
-    facing = below(word, FACINGS)
+    next_word = word_source(rng)
+    facing = sample_below(next_word, FACINGS)
     if values["sample_agent_position"]:
-        pos, free = sample_place(word, None, AGENT_SPACE)
+        pos, free = sample_position(next_word, None, AGENT_SPACE)
     else:
         pos = (MIDDLE, MIDDLE)
         free = occupied(None, pos, COIN_SPACE)
     spots = [sample_spot(rng, values) for _ in range(values["initial_spawns"])]
     if variant.endless:
-        coin = [sample_coin(word, None)] if values["coin_enabled"] else []
+        coin = [sample_coin(next_word, None)] if values["coin_enabled"] else []
         return Level(facing, pos, spots, coin, None, sample_delay(rng, values))
     things = []
-    coins = pick(word, values["num_coins"]) if values["num_coins"] else 0
+    coins = pick(next_word, values["num_coins"]) if values["num_coins"] else 0
     for _ in range(coins + values["use_exit"]):
-        place, free = sample_place(word, free, COIN_SPACE)
-        things.append(inside(place))
+        position, free = sample_position(next_word, free, COIN_SPACE)
+        things.append(inside(position))
     exit_ = things.pop() if values["use_exit"] else None
     return Level(facing, pos, spots, things, exit_, sample_delay(rng, values))
 
 
-def sample_place(word: Callable[[], int], free: np.ndarray | None, space: int) -> tuple[tuple[int, int], np.ndarray]:
-    """A place near a free pixel, and which pixels are free once those around it are occupied.
+def sample_position(next_word: Callable[[], int], free: np.ndarray | None, space: int) -> tuple[Position, np.ndarray]:
+    """A position near a free pixel, and which pixels are free once those around it are occupied.
 
-    free: (84, 84) bool, or None: every pixel is free. space: pixels around the place.
+    free: (84, 84) bool, or None: every pixel is free. space: pixels around the position.
     """
     cells = () if free is None else np.flatnonzero(free)
     # Where nothing is free, the original fails.
-    cell = int(cells[below(word, len(cells))]) if len(cells) else below(word, SCREEN * SCREEN)
+    cell = int(cells[sample_below(next_word, len(cells))]) if len(cells) else sample_below(next_word, SCREEN * SCREEN)
     y, x = divmod(cell, SCREEN)
-    return (x + 2 + below(word, 2), y + 2 + below(word, 2)), occupied(free, (x, y), space)
+    return (x + 2 + sample_below(next_word, 2), y + 2 + sample_below(next_word, 2)), occupied(free, (x, y), space)
 
 
-def occupied(free: np.ndarray | None, pos: tuple[int, int], space: int) -> np.ndarray:
-    """Which pixels are free, (84, 84) bool, once those less than `space` away from the place are occupied.
+def occupied(free: np.ndarray | None, pos: Position, space: int) -> np.ndarray:
+    """Which pixels are free, (84, 84) bool, once those less than `space` away from the position are occupied.
 
     free: (84, 84) bool, or None: every pixel is free.
     """
@@ -87,27 +89,27 @@ def _distant(space: int) -> np.ndarray:
     return offset**2 + offset[:, None] ** 2 >= space**2
 
 
-def inside(pos: tuple[int, int]) -> tuple[int, int]:
-    """The place, moved inside the screen's margin."""
+def inside(pos: Position) -> Position:
+    """The position, moved inside the screen's margin."""
     x, y = (min(max(part, MARGIN), SCREEN - MARGIN) for part in pos)
     return x, y
 
 
-def sample_coin(word: Callable[[], int], last: tuple[int, int] | None) -> tuple[int, int]:
+def sample_coin(next_word: Callable[[], int], last: Position | None) -> Position:
     """The endless task's next coin, away from the last one. It may lie under the agent, as in the original."""
     free = None if last is None else occupied(None, last, AGENT_SPACE)
-    return inside(sample_place(word, free, AGENT_SPACE)[0])
+    return inside(sample_position(next_word, free, AGENT_SPACE)[0])
 
 
 def sample_spot(rng: np.random.Generator, values: dict[str, Any]) -> list[float]:
     """A new spotlight, a column of State.spots. Its path is bent, from one side of the screen to roughly the other."""
-    word = words(rng)
+    next_word = word_source(rng)
     least, slowest = int(values["spot_min_radius"]), values["spot_min_speed"]
-    radius = least + below(word, max(int(values["spot_max_radius"]) - least, 0) + 1)
+    radius = least + sample_below(next_word, max(int(values["spot_max_radius"]) - least, 0) + 1)
     speed = rng.uniform(slowest, max(slowest, values["spot_max_speed"]))
-    start = below(word, 360)
-    target = start + 180 - 45 + below(word, 90)
-    offset = target - 135 + below(word, 270)
+    start = sample_below(next_word, 360)
+    target = start + 180 - 45 + sample_below(next_word, 90)
+    offset = target - 135 + sample_below(next_word, 270)
     far = OUTSIDE + radius
     x, y = (MIDDLE + far * part for part in UNITS[start])
     to_x, to_y = (MIDDLE + far * part for part in UNITS[target])
@@ -119,13 +121,13 @@ def sample_spot(rng: np.random.Generator, values: dict[str, Any]) -> list[float]
 
 def sample_delay(rng: np.random.Generator, values: dict[str, Any]) -> int:
     """The steps added to the next interval between spotlights. A list of one takes no draw."""
-    return pick(words(rng), values["spawn_delay"])
+    return pick(word_source(rng), values["spawn_delay"])
 
 
 @cache
 def _extent(scale: float) -> float:
     """How far from the agent's centre a spotlight may end and still show some of it, in pixels."""
-    hands = max(math.hypot(*place) for facing in range(FACINGS) for place in hand_places(scale, facing))
+    hands = max(math.hypot(*hand) for facing in range(FACINGS) for hand in hand_offsets(scale, facing))
     return max(radius_of(scale), hands + int(10 * scale)) + 3  # as both are drawn at whole pixels
 
 
@@ -156,8 +158,8 @@ def write_level(s: State, lane: int, level: Level, spawns: int, show_limit: int)
     s.bodies[:, lane, AGENT] = level.pos
     for axis in range(2):
         s.pos[lane, axis] = level.pos[axis] + PAD
-    for coin, place in enumerate(level.coins):
-        s.bodies[:, lane, COIN + coin] = place
+    for coin, position in enumerate(level.coins):
+        s.bodies[:, lane, COIN + coin] = position
     s.targets[lane] = 0.0
     if level.exit is not None:
         s.bodies[:, lane, EXIT] = s.targets[lane, 2:] = level.exit
@@ -167,7 +169,7 @@ def write_level(s: State, lane: int, level: Level, spawns: int, show_limit: int)
     s.spots[:, lane], s.spot_key[lane], s.num_spots[lane] = NO_SPOT[:, None], NO_KEY, spots
     if spots:
         s.spots[:, lane, :spots] = np.array(level.spots).T
-        s.spot_key[lane, :spots] = [spot[RADIUS] * PLACES + PLACE_0 for spot in level.spots]
+        s.spot_key[lane, :spots] = [spot[RADIUS] * POSITIONS + POSITION_0 for spot in level.spots]
     s.spot_place[:, lane], s.near_light[lane] = 0, False  # they shine from the first step on
     s.spawns_left[lane] = spawns
     start_wait(s, lane, level.delay)

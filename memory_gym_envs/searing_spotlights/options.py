@@ -4,7 +4,7 @@ from typing import Any
 
 from memory_gym_envs.entries import Entries
 from memory_gym_envs.options import Option
-from memory_gym_envs.variant import Variant, agent_scale, agent_speed, max_steps, present
+from memory_gym_envs.variant import Variant, agent_scale, agent_speed, applicable, max_steps
 
 SPOT_RADII = (1, 42)  # pixels; the largest spotlight is as wide as the screen
 MOST_COINS = 20
@@ -73,16 +73,16 @@ def body_rows(endless: bool) -> list[tuple[bool, Option]]:
 def entry_rows(endless: bool) -> tuple[Entries, ...]:
     """The entries of an id's vector."""
     action = "the action in the bar, one-hot: none, {}, {}; zeros: hidden"
-    place = "{}: visible pixels / 144, at most 1; x and y of their middle, / 84"
+    body = "{}: visible pixels / 144, at most 1; x and y of their middle, / 84"
     tiles = "of each tile of 12 x 12 pixels, row by row, the share that is {}, without the bar's pixels"
     table: list[tuple[Any, ...]] = [
         (True, "health", 1, "share of the bar's left half that is green"),
         (True, "horizontal", 3, action.format("left", "right")),
         (True, "vertical", 3, action.format("up", "down")),
         (True, "rewarded", 1, "1 where the bar shows a positive reward"),
-        (True, "agent", 3, place.format("the agent")),
-        (not endless, "exit", 3, place.format("the exit without its black frame")),
-        (True, "coin", 3, place.format("the coin, or all of them")),
+        (True, "agent", 3, body.format("the agent")),
+        (not endless, "exit", 3, body.format("the exit without its black frame")),
+        (True, "coin", 3, body.format("the coin, or all of them")),
         (True, "facing", 8, "the agent's facing where all of it is visible, one-hot"),
         (not endless, "exit_open", 1, "1 where an open exit is visible"),
         (not endless, "coins", 49, tiles.format("coins")),
@@ -90,12 +90,12 @@ def entry_rows(endless: bool) -> tuple[Entries, ...]:
         (True, "dusk", 1, "brightness of the floor outside of the light, while any is visible"),
         (True, "alarm", 1, "1 where red floor is visible"),
     ]
-    return present((has_it, Entries(*row)) for has_it, *row in table)
+    return applicable((has_it, Entries(*row)) for has_it, *row in table)
 
 
 def make_variant(endless: bool) -> Variant:
     """The finite id, or the endless one: one coin after the other, no exit. The original's options are in its order."""
-    options = present(light_rows(endless) + body_rows(endless))
+    options = applicable(light_rows(endless) + body_rows(endless))
     return Variant(25, options, entry_rows(endless), endless=endless)
 
 

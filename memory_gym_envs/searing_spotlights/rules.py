@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from memory_gym_envs.base import ALL, NO_LIMIT
-from memory_gym_envs.bits import PLACE_0, PLACES
+from memory_gym_envs.bits import POSITION_0, POSITIONS
 from memory_gym_envs.character import radius_of
 from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.searing_spotlights.state import (
@@ -49,7 +49,7 @@ def add_spot(s: State, lane: int, spot: list[float], delay: int) -> None:
         # Every step reads all slots, so there are few spare ones, unless so many are in use that growing costs more.
         make_room(s, "S", at + max(2, at // 8))
     s.spots[:, lane, at] = spot
-    s.spot_key[lane, at] = spot[RADIUS] * PLACES + PLACE_0
+    s.spot_key[lane, at] = spot[RADIUS] * POSITIONS + POSITION_0
     s.num_spots[lane] = at + 1
     s.spawns_left[lane] -= 1
     start_wait(s, lane, delay)
@@ -61,22 +61,22 @@ def start_wait(s: State, lane: int, delay: int) -> None:
     s.spawn_wait[lane] = s.spawn_interval[lane] + delay if s.spawns_left[lane] else NO_LIMIT
 
 
-def spot_places(spots: np.ndarray) -> np.ndarray:
+def spot_positions(spots: np.ndarray) -> np.ndarray:
     """Where spotlights (11, N, S) are on their paths, x and y in pixels: (2, N, S) float64."""
-    place = spots[TIME] * spots[BEND]
-    place += spots[TOWARD]
-    place *= spots[TIME]
-    place += spots[START]
-    return place
+    positions = spots[TIME] * spots[BEND]
+    positions += spots[TOWARD]
+    positions *= spots[TIME]
+    positions += spots[START]
+    return positions
 
 
 def move_spots(s: State) -> np.ndarray:
     """Moves the spotlights on; (N,) bool whose agent is in the light."""
     pausing = remove_finished(s) if np.count_nonzero(s.spots[TIME] >= 1.0) else None
     time = s.spots[TIME]  # (N, S)
-    spot = spot_places(s.spots)  # (2, N, S)
-    place = spot.astype(np.int64)
-    place += s.spot_key
+    spot = spot_positions(s.spots)  # (2, N, S)
+    key = spot.astype(np.int64)
+    key += s.spot_key
     spot -= s.bodies[:, :, :1]
     spot *= spot
     distance = spot[0] + spot[1]  # (N, S) squared
@@ -85,8 +85,8 @@ def move_spots(s: State) -> np.ndarray:
     else:
         held = time[pausing]
         time += s.spots[SPEED]
-        time[pausing], distance[pausing], place[(ALL, *pausing)] = held, np.inf, 0
-    s.spot_place, s.near_light = place, (distance <= s.spots[SIGHT]).any(axis=1)
+        time[pausing], distance[pausing], key[(ALL, *pausing)] = held, np.inf, 0
+    s.spot_place, s.near_light = key, (distance <= s.spots[SIGHT]).any(axis=1)
     return (distance <= s.spots[REACH]).any(axis=1) if np.count_nonzero(s.near_light) else s.near_light
 
 
@@ -99,17 +99,17 @@ def remove_finished(s: State) -> tuple[np.ndarray, np.ndarray]:
     lanes, slots = [], []
     for lane in np.flatnonzero((s.spots[TIME] >= 1.0).any(axis=1)).tolist():
         through = s.spots[TIME, lane] >= 1.0
-        kept, pausing, at = list(range(int(s.num_spots[lane]))), [], 0
-        while at < len(kept):
-            if through[kept[at]]:
-                del kept[at]
-                pausing += kept[at : at + 1]
+        remaining, pausing, at = list(range(int(s.num_spots[lane]))), [], 0
+        while at < len(remaining):
+            if through[remaining[at]]:
+                del remaining[at]
+                pausing += remaining[at : at + 1]
             at += 1
-        left = len(kept)
-        s.spots[:, lane, :left], s.spot_key[lane, :left] = s.spots[:, lane, kept], s.spot_key[lane, kept]
+        left = len(remaining)
+        s.spots[:, lane, :left], s.spot_key[lane, :left] = s.spots[:, lane, remaining], s.spot_key[lane, remaining]
         s.spots[:, lane, left:], s.spot_key[lane, left:] = NO_SPOT[:, None], NO_KEY
         s.num_spots[lane] = left
-        slots += [kept.index(each) for each in pausing]
+        slots += [remaining.index(each) for each in pausing]
         lanes += [lane] * len(pausing)
     return np.array(lanes, np.intp), np.array(slots, np.intp)
 
@@ -159,9 +159,9 @@ def coin_show_limit(values: dict[str, Any], first: bool) -> int:
     return values.get("coin_show_duration", 0) if first or values["coin_feedback"] else 0
 
 
-def place_coin(s: State, lane: int, place: tuple[int, int], show_limit: int) -> None:
+def put_coin(s: State, lane: int, coin: tuple[int, int], show_limit: int) -> None:
     """Puts the endless task's next coin there, x and y in pixels. show_limit: as in write_level."""
-    s.bodies[:, lane, COIN] = place
+    s.bodies[:, lane, COIN] = coin
     s.coins_left[lane], s.coin_age[lane], s.coin_show_limit[lane] = 1, 0, show_limit
     update_targets(s, lane)
 

@@ -15,12 +15,12 @@ AGENT, EXIT, COIN = 0, 1, 2  # bodies; coins are the last ones
 GONE = 180  # the position of bodies that do not exist, in pixels: too far away to be touched or seen
 AWAY = -1000  # the position of spotlights that do not exist
 
-# What is known of a spotlight, a row of State.spots. Its place at time t is START + t * (TOWARD + t * BEND).
+# What is known of a spotlight, a row of State.spots. Its position at time t is START + t * (TOWARD + t * BEND).
 # It hurts within REACH of the agent's centre and may show a part of it within SIGHT, both squared.
 TIME, SPEED, RADIUS, REACH, SIGHT = range(5)
 START, TOWARD, BEND = slice(5, 7), slice(7, 9), slice(9, 11)
 NO_SPOT = np.array([0.0, 0.0, 0.0, -1.0, -1.0, AWAY, AWAY, 0.0, 0.0, 0.0, 0.0])  # (11,)
-NO_KEY = -AWAY  # brings a spotlight that does not exist to place 0
+NO_KEY = -AWAY  # brings a spotlight that does not exist to key 0
 
 UNDER, BELOW_BAR, ABOVE_BAR = range(3)  # where a body is drawn: under the darkness, or above it and relative to the bar
 FADE = 257  # steps after which the darkness no longer changes
@@ -44,9 +44,9 @@ class State(WalkingState):
     success: np.ndarray = array("N")  # 1 when the task is done
     # The spotlights, oldest first; rows are TIME .. BEND.
     spots: np.ndarray = array(len(NO_SPOT), "N", "S", dtype=np.float64, fill=NO_SPOT[:, None, None])
-    spot_key: np.ndarray = array("N", "S", fill=NO_KEY)  # where the radius begins in SpotStencils, plus PLACE_0
+    spot_key: np.ndarray = array("N", "S", fill=NO_KEY)  # where the radius begins in SpotStencils, plus POSITION_0
     num_spots: np.ndarray = array("N")  # spotlights
-    spot_place: np.ndarray = array(2, "N", "S")  # where each shines, x and y as indices of SpotStencils; 0: nowhere
+    spot_place: np.ndarray = array(2, "N", "S")  # where each shines: x and y as keys of SpotStencils; 0: nowhere
     near_light: np.ndarray = array("N", dtype=bool)  # some of the agent may be in the light
     spawn_wait: np.ndarray = array("N")  # steps until the next spotlight
     spawns_left: np.ndarray = array("N")  # spotlights to follow

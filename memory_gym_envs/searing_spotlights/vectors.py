@@ -1,7 +1,7 @@
 """Vector observations.
 
 All that a vector says of what is below the bar comes from every third pixel, by its colour.
-Shape letters: N lanes, n some of them, m of those some, S spotlights that fit, K bodies, V entries of a vector.
+Shape letters: N lanes, n some of them, m some of those, S spotlights, K bodies, V entries of a vector, U uint64s.
 """
 
 from functools import cache, lru_cache
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from memory_gym_envs import bits
-from memory_gym_envs.bits import FULL_ROW, ITEMS, PLACE_0, PLACES, SAMPLE_ROWS, SAMPLE_STEP, Stencils
+from memory_gym_envs.bits import FULL_ROW, ITEMS, POSITION_0, POSITIONS, ROW_STEP, SUBSAMPLE_ROWS, Stencils
 from memory_gym_envs.character import FACINGS, sprites
 from memory_gym_envs.drawing import BLUE, GREEN, SCREEN, read_only
 from memory_gym_envs.entries import vector_slices
@@ -23,11 +23,11 @@ from memory_gym_envs.variant import Variant
 FAINT = 252  # the highest opacity at which an agent, (3, 3, 2) then, still differs from white floor
 SLIGHT = 5  # the highest opacity that may leave some colours as they are
 FIRST_RIM = 51  # the lowest opacity at which a rim differs from all colours under it, if only by 1
-ROWS_BELOW = np.where(np.arange(0, SCREEN, SAMPLE_STEP) < TOP_BAR, np.uint64(0), FULL_ROW)  # (42,) below the bar
+ROWS_BELOW = np.where(np.arange(0, SCREEN, ROW_STEP) < TOP_BAR, np.uint64(0), FULL_ROW)  # (42,) below the bar
 TILE_SHARE = 1 / bits.tile_counts(ROWS_BELOW[None]).astype(np.float32)  # (1, 49)
 FULL_SHARE = TILE_SHARE.min()  # of a tile beside the bar
 BLUE_TILES = (drawing.floors()[BLUE_FLOOR].reshape(SCREEN, SCREEN, 3) == BLUE).all(axis=-1)  # or the red ones
-BLUE_SAMPLE = bits.sample(BLUE_TILES)  # (42,)
+BLUE_SUBSAMPLE = bits.subsample(BLUE_TILES)  # (42,)
 NO_BITS = np.uint64(0)
 READING = slice(0, 8)  # the entries that are read from the bar
 # By opacity: (256, 2) all bits where the darkness changes nothing, and where it hides nothing; and the brightness of
@@ -57,11 +57,11 @@ class VectorTables(NamedTuple):
 
     width: int  # of a vector
     at: dict[str, slice]  # where its entries are
-    places: slice  # where those on the bodies' places are
+    body_entries: slice  # those on the bodies
     bars: np.ndarray
     readings: np.ndarray
-    shapes: Stencils  # samples: spotlights by radius, figures in all facings, a coin, an exit and a door for each scale
-    rims: Stencils  # samples of spotlights' outlines
+    shapes: Stencils  # subsamples: spotlights by radius, figures in all facings, coin, exit and door for each scale
+    rims: Stencils  # subsamples of spotlights' outlines
     high: Stencils  # masks of the bar's rows with the same shapes
     # The exit's door follows the bodies in the next two; the endless id has none, and K rows.
     key: np.ndarray  # (K + 1, N) where the lanes' bodies are in those tables
@@ -95,13 +95,13 @@ def make_vector_tables(
     return VectorTables(
         width=at["alarm"].stop,
         at=at,
-        places=slice(at["agent"].start, at["coin"].stop),
+        body_entries=slice(at["agent"].start, at["coin"].stop),
         bars=drawing.bars(variant.endless),
         readings=readings(variant.endless),
         shapes=shapes,
         rims=rims,
         high=high,
-        key=np.stack(key) * PLACES + PLACE_0,
+        key=np.stack(key) * POSITIONS + POSITION_0,
         bodies=np.array(bodies),
         coin=1 if variant.endless else COIN,
         has_hands=np.array([int(10 * scale) > 0 for scale in figure_scales])[s.figure // 2],
@@ -119,11 +119,11 @@ def vector_shapes(
     # An exit's frame is as black as the dark, so only its door is visible.
     things = [each for i in range(0, len(solids), 3) for each in (*solids[i : i + 2], images[i + 1].any(axis=-1))]
     shapes = disks + figures + things
-    return bits.samples(shapes), bits.samples(rims), bits.stencils(shapes, TOP_BAR)
+    return bits.subsample_stencils(shapes), bits.subsample_stencils(rims), bits.stencils(shapes, TOP_BAR)
 
 
-class FrameSamples(NamedTuple):
-    """n lanes' frames as samples, (n, 42) uint64 each, and the K bodies in them."""
+class SubsampledFrames(NamedTuple):
+    """n lanes' frames, subsampled, (n, 42) uint64 each, and the K bodies in them."""
 
     opacity: np.ndarray  # (n,) of the darkness
     lit: np.ndarray  # pixels that the darkness leaves as they are
@@ -143,21 +143,21 @@ def make_vectors(s: State, g: VectorTables, lanes: Lanes) -> np.ndarray:
 
     They depend on the colours of the bar and of every third pixel below it, so equal frames have equal vectors.
     """
-    sampled = sample_frames(s, g, lanes)
-    out = np.zeros((len(sampled.lit), g.width), np.float32)
-    write_bar(s, g, lanes, sampled, out)
-    write_rest(s, g, lanes, sampled, out)
+    subsampled = subsample_frames(s, g, lanes)
+    out = np.zeros((len(subsampled.lit), g.width), np.float32)
+    write_bar(s, g, lanes, subsampled, out)
+    write_rest(s, g, lanes, subsampled, out)
     return out
 
 
-def sample_frames(s: State, g: VectorTables, lanes: Lanes) -> FrameSamples:
-    """The lanes' frames as samples."""
-    place, each = s.spot_place[:, lanes, : int(s.num_spots.max())], np.arange(len(s.pos))[lanes]
-    spots, has_exit = place.shape[2], g.coin == COIN
+def subsample_frames(s: State, g: VectorTables, lanes: Lanes) -> SubsampledFrames:
+    """The lanes' frames, subsampled."""
+    spot_key, each = s.spot_place[:, lanes, : int(s.num_spots.max())], np.arange(len(s.pos))[lanes]
+    spots, has_exit = spot_key.shape[2], g.coin == COIN
     key = np.empty((2, spots + len(g.key), len(each)), np.int64)
-    key[:, :spots] = place.transpose(0, 2, 1)
+    key[:, :spots] = spot_key.transpose(0, 2, 1)
     np.add(s.bodies[:, lanes].transpose(0, 2, 1)[:, g.bodies], g.key[:, lanes], out=key[:, spots:])
-    key[:, spots + AGENT] += s.drawn_facing[lanes] * PLACES
+    key[:, spots + AGENT] += s.drawn_facing[lanes] * POSITIONS
     shapes = g.shapes.at(*key)  # (S + K + 1, n, 42)
     lit, rim = drawing.overlay(shapes[:spots], g.rims, key[:, :spots], s.rim[lanes])
     opacity = s.darkness[each, np.minimum(s.length[lanes], FADE - 1)]
@@ -172,11 +172,11 @@ def sample_frames(s: State, g: VectorTables, lanes: Lanes) -> FrameSamples:
     if has_exit:
         seen[EXIT] &= shapes[-1]
     x, y = key[:, bodies]
-    return FrameSamples(opacity, lit, clear, rim, x, y, raised, layer, cover, seen, floor)
+    return SubsampledFrames(opacity, lit, clear, rim, x, y, raised, layer, cover, seen, floor)
 
 
 def layers(s: State, g: VectorTables, lanes: Lanes) -> tuple[np.ndarray, np.ndarray | None]:
-    """FrameSamples' raised and layer."""
+    """SubsampledFrames' raised and layer."""
     coins = s.coin_age[lanes] < s.coin_show_limit[lanes]
     (raised,) = (coins | s.layered[lanes]).nonzero()
     if not raised.size:
@@ -208,34 +208,35 @@ def visible_parts_in_layers(cover: np.ndarray, clear: np.ndarray, layer: np.ndar
     return seen_above | seen_below, floor & free
 
 
-def write_bar(s: State, g: VectorTables, lanes: Lanes, sampled: FrameSamples, out: np.ndarray) -> None:
+def write_bar(s: State, g: VectorTables, lanes: Lanes, subsampled: SubsampledFrames, out: np.ndarray) -> None:
     """Writes health, actions and reward."""
     rows = drawing.bar_rows(s, lanes)
     out[:, READING] = g.readings.take(rows, axis=0)
-    if sampled.layer is not None and (sampled.layer == ABOVE_BAR).any():
-        high, over_bar = sampled.raised, sampled.layer == ABOVE_BAR  # (m,), (K, m, 1)
-        cover = g.high.at(sampled.x[:, high], sampled.y[:, high]) * over_bar  # (K, m, words)
+    if subsampled.layer is not None and (subsampled.layer == ABOVE_BAR).any():
+        high, over_bar = subsampled.raised, subsampled.layer == ABOVE_BAR  # (m,), (K, m, 1)
+        cover = g.high.at(subsampled.x[:, high], subsampled.y[:, high]) * over_bar  # (K, m, U)
         left = ~np.bitwise_or.reduce(cover, axis=0).view(np.uint16).reshape(-1, TOP_BAR, ITEMS)
         columns = bits.unpacked(np.bitwise_or.reduce(left, axis=1))  # (m, 84) those of which anything is left
         out[high, READING] = read_bars(g.bars[rows[high]].reshape(-1, SCREEN, 3) * columns[..., None])
 
 
-def write_rest(s: State, g: VectorTables, lanes: Lanes, sampled: FrameSamples, out: np.ndarray) -> None:
+def write_rest(s: State, g: VectorTables, lanes: Lanes, subsampled: SubsampledFrames, out: np.ndarray) -> None:
     """Writes the other entries."""
-    cover, seen, (bodies, n, _) = sampled.cover, sampled.seen, sampled.seen.shape
-    bright, visible, dusk = sampled.lit & sampled.floor, sampled.clear & sampled.floor, DUSK.take(sampled.opacity)
-    if sampled.rim is not None:
-        bright = np.where(s.rim[lanes][:, None], rims_left(sampled, sampled.rim), bright)
+    cover, seen, (bodies, n, _) = subsampled.cover, subsampled.seen, subsampled.seen.shape
+    bright, visible = subsampled.lit & subsampled.floor, subsampled.clear & subsampled.floor
+    dusk = DUSK.take(subsampled.opacity)
+    if subsampled.rim is not None:
+        bright = np.where(s.rim[lanes][:, None], rims_left(subsampled, subsampled.rim), bright)
         dusk = dusk * ~s.rim[lanes]
-    lines = np.empty((bodies + 3, n, SAMPLE_ROWS), np.uint64)
+    lines = np.empty((bodies + 3, n, SUBSAMPLE_ROWS), np.uint64)
     lines[:bodies] = seen
     np.bitwise_and(cover[AGENT] & ROWS_BELOW, ~seen[AGENT], out=lines[bodies])  # hidden parts of the agent
     np.bitwise_xor(visible, bright, out=lines[bodies + 1])  # visible floor outside of the light
-    np.bitwise_and(visible, BLUE_SAMPLE, out=lines[bodies + 2])  # visible floor that is blue or red
+    np.bitwise_and(visible, BLUE_SUBSAMPLE, out=lines[bodies + 2])  # visible floor that is blue or red
     any_ = np.bitwise_or.reduce(lines, axis=2) != 0  # (K + 3, n)
     out[:, g.at["dusk"].start] = dusk * any_[-2]
     out[:, g.at["alarm"].start] = (s.floor & s.reddens)[lanes] * any_[-1]
-    write_places(g, seen, any_[:bodies], out)
+    write_bodies(g, seen, any_[:bodies], out)
     (whole,) = (any_[AGENT] & ~any_[bodies] & g.has_hands[lanes]).nonzero()
     out[whole, g.at["facing"].start + s.drawn_facing[lanes][whole]] = 1
     if "exit" in g.at:
@@ -243,7 +244,7 @@ def write_rest(s: State, g: VectorTables, lanes: Lanes, sampled: FrameSamples, o
     write_tiles(g, seen, any_[:bodies], bright, out)
 
 
-def write_places(g: VectorTables, seen: np.ndarray, any_: np.ndarray, out: np.ndarray) -> None:
+def write_bodies(g: VectorTables, seen: np.ndarray, any_: np.ndarray, out: np.ndarray) -> None:
     """Writes how much of the bodies is visible, and where. any_: (K, n) whether any is."""
     (bodies, n), kinds = any_.shape, g.coin + 1
     body, lane = any_.nonzero()
@@ -256,7 +257,7 @@ def write_places(g: VectorTables, seen: np.ndarray, any_: np.ndarray, out: np.nd
         total = each[body, lane]
     total[:, 1:] /= SCREEN * total[:, :1]
     np.minimum(total[:, 0] * FULL_SHARE, 1, out=total[:, 0])
-    out[:, g.places].reshape(n, kinds, 3)[lane, body] = total
+    out[:, g.body_entries].reshape(n, kinds, 3)[lane, body] = total
 
 
 def write_tiles(g: VectorTables, seen: np.ndarray, any_: np.ndarray, bright: np.ndarray, out: np.ndarray) -> None:
@@ -270,10 +271,10 @@ def write_tiles(g: VectorTables, seen: np.ndarray, any_: np.ndarray, bright: np.
     out[:, g.at["light"]], out[lanes, g.at["coins"]] = share[: len(bright)], share[len(bright) :]
 
 
-def rims_left(sampled: FrameSamples, rim: np.ndarray) -> np.ndarray:
+def rims_left(subsampled: SubsampledFrames, rim: np.ndarray) -> np.ndarray:
     """What is visible of these rims, (n, 42): none in a faint darkness, and nothing under bodies above the darkness."""
-    rim = rim & ROWS_BELOW & -(sampled.opacity >= FIRST_RIM)[:, None].astype(np.uint64)
-    if sampled.layer is not None:
-        above = np.where(sampled.layer == UNDER, NO_BITS, sampled.cover[:, sampled.raised])
-        rim[sampled.raised] &= ~np.bitwise_or.reduce(above, axis=0)
+    rim = rim & ROWS_BELOW & -(subsampled.opacity >= FIRST_RIM)[:, None].astype(np.uint64)
+    if subsampled.layer is not None:
+        above = np.where(subsampled.layer == UNDER, NO_BITS, subsampled.cover[:, subsampled.raised])
+        rim[subsampled.raised] &= ~np.bitwise_or.reduce(above, axis=0)
     return rim

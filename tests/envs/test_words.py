@@ -6,7 +6,7 @@ from helpers import check_same
 from numpy.random import MT19937, PCG64, PCG64DXSM, SFC64, Generator, Philox
 
 from memory_gym_envs.bits import bit_counts
-from memory_gym_envs.words import LOW, PERCENT_AGAIN, WordBuffer, below, words
+from memory_gym_envs.words import LOW, PERCENT_AGAIN, WordBuffer, sample_below, word_source
 
 LIMITS = [
     1,
@@ -39,9 +39,9 @@ def same_state(one, other):
 def test_words_make_the_generators_numbers(kind):
     for seed in range(4):
         rng, twin = twins(kind, seed)
-        word = words(rng)
+        next_word = word_source(rng)
         for limit in LIMITS * 20:
-            assert below(word, limit) == twin.integers(0, limit)
+            assert sample_below(next_word, limit) == twin.integers(0, limit)
         assert same_state(rng, twin)
 
 
@@ -64,7 +64,7 @@ def test_a_tape_makes_the_generators_numbers(kind):
         buffer = WordBuffer(rng, 2000)
         for limit in LIMITS * 20:
             assert buffer.eighths[buffer.used] == buffer.words[buffer.used] * 8 >> 32
-            assert below(buffer, limit) == twin.integers(0, limit)
+            assert sample_below(buffer, limit) == twin.integers(0, limit)
         things = list(range(24))
         assert buffer.sample_each(things, 33) == [thing for thing in things if twin.integers(0, 100) < 33]
         for count in (0, 1, 4, 23, 24, 25):
@@ -92,7 +92,7 @@ def test_hits_at_the_edges_of_every_number(percent):
         for word in ((edge - 1) & LOW, edge, edge + 1):
             buffer, one_by_one = loaded([5, word, 7]), loaded([5, word, 7])
             assert buffer.sample_each([10, 11, 12], percent) == [
-                10 + i for i in range(3) if below(one_by_one, 100) < percent
+                10 + i for i in range(3) if sample_below(one_by_one, 100) < percent
             ]
             assert buffer.used == one_by_one.used == 3 + (word in PERCENT_AGAIN)
     assert len(PERCENT_AGAIN) == (1 << 32) % 100
