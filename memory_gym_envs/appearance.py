@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from memory_gym_envs.character import FACINGS, LARGEST_RADIUS, PAD, PIXELS, SPAN, radius_of
-from memory_gym_envs.drawing import SCREEN
+from memory_gym_envs.drawing import SCREEN, with_margin
 from memory_gym_envs.entries import Entries, vector_slices
 
 UNSEEN = SPAN  # the position of an agent of which nothing shows, and its size
@@ -60,10 +60,7 @@ class AppearanceTables(NamedTuple):
 def tables_of(views: list[View]) -> AppearanceTables:
     """Prepares the views."""
     width = max(view.solid.shape[1] for view in views) + 2
-    solids = []
-    for view in views:
-        margin = (width - view.solid.shape[1]) // 2
-        solids.append(np.pad(view.solid, ((0, 0), (margin, margin), (margin, margin))))
+    solids = [with_margin(view.solid, (width - view.solid.shape[1]) // 2) for view in views]
     return AppearanceTables(np.concatenate([appearance_codes(view) for view in views]), np.concatenate(solids))
 
 

@@ -150,13 +150,8 @@ def tile_counts(lines: np.ndarray) -> np.ndarray:
 _X, _Y = (ITEM * np.arange(ITEMS)[:, None] + SUBSAMPLE_COLUMNS).reshape(-1), ROW_STEP * np.arange(SUBSAMPLE_ROWS)
 _DIGITS = SCREEN.bit_length()  # of an x
 # A row's pixels whose x has this binary digit; first all of them: (1 + _DIGITS, 1) uint64.
-_PLANES = np.stack(
-    [FULL_ROW]
-    + [
-        np.bitwise_or.reduce((_X >> digit & 1).astype(np.uint64) << np.arange(56, dtype=np.uint64))
-        for digit in range(_DIGITS)
-    ]
-)[:, None]
+_PLANES = (_X >> np.arange(_DIGITS)[:, None] & 1).astype(np.uint64) @ (1 << np.arange(len(_X), dtype=np.uint64))
+_PLANES = np.append(FULL_ROW, _PLANES)[:, None]
 # (8 * 42, 3) float32: what their counts add to the number of pixels and to the sums of x and of y.
 _MOMENTS: np.ndarray = np.zeros((1 + _DIGITS, SUBSAMPLE_ROWS, 3), np.float32)
 _MOMENTS[0] = np.stack([np.ones(SUBSAMPLE_ROWS), np.full(SUBSAMPLE_ROWS, 0.5), _Y + 0.5], axis=1)

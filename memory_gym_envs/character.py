@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memory_gym_envs.drawing import SCREEN, Sheet, disk, make_sheet, ring
+from memory_gym_envs.drawing import SCREEN, Sheet, disk, make_sheet, ring, with_margin
 
 PAD = 25  # the radius of the largest agent, of which nothing shows at position 0
 SPAN = 137  # stored positions are 0 .. SPAN-1
@@ -144,13 +144,11 @@ def agent_tables(figures: tuple[Figure, ...]) -> AgentTables:
     walk = np.concatenate([walk_table(figure) for figure in figures])
     pictures = [sprites(figure.scale) for figure in figures]
     width = min(SCREEN, max(solid.shape[1] for _, solid in pictures))
-    images, solids = [], []
-    for image, solid in pictures:
-        margin = (width - solid.shape[1]) // 2
-        around = ((0, 0), (margin, margin), (margin, margin))
-        images.append(np.pad(image, (*around, (0, 0))))
-        solids.append(np.pad(solid, around))
-    return AgentTables(walk, make_sheet(np.concatenate(images), np.concatenate(solids), PIXELS))
+    images, solids = (
+        np.concatenate([with_margin(each, (width - each.shape[1]) // 2) for each in kind])
+        for kind in zip(*pictures, strict=True)
+    )
+    return AgentTables(walk, make_sheet(images, solids, PIXELS))
 
 
 def walk(

@@ -73,6 +73,11 @@ def turned(mask: np.ndarray, degrees: float, size: int) -> np.ndarray:
     return inside & mask[source_y.clip(0, old - 1), source_x.clip(0, old - 1)]
 
 
+def with_margin(pictures: np.ndarray, margin: int) -> np.ndarray:
+    """Pictures or masks (K, W, W, ...) with so many more pixels on each of the four sides, black or False."""
+    return np.pad(pictures, [(0, 0), (margin, margin), (margin, margin)] + [(0, 0)] * (pictures.ndim - 3))
+
+
 @cache
 def tile_picture(width: int, inside: tuple[int, int, int], edge: tuple[int, int, int]) -> np.ndarray:
     """(W, W, 3) uint8, read-only: a tile with an edge of one pixel."""

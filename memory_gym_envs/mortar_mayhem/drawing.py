@@ -7,9 +7,8 @@ from functools import cache
 
 import numpy as np
 
-from memory_gym_envs.base import DEBUG_ZOOM
-from memory_gym_envs.character import FACINGS, PAD
-from memory_gym_envs.drawing import GREEN, ROW, SCREEN, Sheet, paste, read_only, ring, tile_picture, turned
+from memory_gym_envs.character import FACINGS
+from memory_gym_envs.drawing import ROW, SCREEN, Sheet, paste, read_only, ring, tile_picture, turned
 from memory_gym_envs.mortar_mayhem.arena import COMMANDS, FLOORS, TILE, first_pixel
 from memory_gym_envs.mortar_mayhem.state import State
 from memory_gym_envs.state import Lanes
@@ -67,10 +66,3 @@ def draw(s: State, sheet: Sheet, lanes: Lanes) -> np.ndarray:
         square = frames.reshape(-1, SCREEN, ROW)[:, SYMBOL_AT : SYMBOL_AT + SYMBOL, 3 * SYMBOL_AT :][..., : 3 * SYMBOL]
         square |= symbols().take(symbol, axis=0)  # (n, SYMBOL, 3 * SYMBOL)
     return frames.reshape(-1, SCREEN, SCREEN, 3)
-
-
-def circle_target(frame: np.ndarray, s: State, lane: int) -> None:
-    """Draws a circle on the lane's target tile into its magnified frame, (336, 336, 3) uint8, in place."""
-    radius = TILE * DEBUG_ZOOM // 2
-    x, y = ((s.target_corner[lane] - PAD) * DEBUG_ZOOM + radius).tolist()
-    frame[ring(len(frame), x, y, radius, 2 * DEBUG_ZOOM)] = GREEN

@@ -8,12 +8,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.character import Figure
+from memory_gym_envs.appearance import VectorTables, vector_tables
+from memory_gym_envs.base import DEBUG_ZOOM
+from memory_gym_envs.character import FACINGS, PAD, Figure
+from memory_gym_envs.drawing import GREEN, ring
 from memory_gym_envs.mortar_mayhem import drawing, levels, rules, vectors
 from memory_gym_envs.mortar_mayhem.arena import COMMANDS, FLOORS, TILE, TORUS_SIZE, first_pixel
 from memory_gym_envs.mortar_mayhem.options import VARIANTS, VECTOR_COMMANDS, MortarVariant
 from memory_gym_envs.mortar_mayhem.state import State
-from memory_gym_envs.mortar_mayhem.vectors import VectorTables
 from memory_gym_envs.state import Lanes, empty, make_room
 from memory_gym_envs.walking import WalkingVectorEnv
 from memory_gym_envs.words import sample_below, word_source
@@ -138,7 +140,10 @@ class MortarMayhem(WalkingVectorEnv):
 
     def vector_tables(self) -> VectorTables:
         """The tables of vector observations."""
-        return vectors.make_vector_tables(self.variant, self.figures, self.state.figure)
+        sprites = FACINGS * (len(drawing.symbols()) if self.variant.clue else 1)  # of each figure
+        appearance = vectors.appearance_tables(self.figures, self.variant.clue)
+        scales = [figure.scale for figure in self.figures]
+        return vector_tables(self.variant.entries, appearance, self.state.figure * sprites, scales, TILE)
 
     def begin(self, lanes: np.ndarray) -> None:
         """Samples the lanes' next levels and starts their episodes."""
@@ -244,4 +249,6 @@ class MortarMayhem(WalkingVectorEnv):
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Circles the lane's target tile in its magnified frame, in place."""
-        drawing.circle_target(frame, self.state, lane)
+        radius = TILE * DEBUG_ZOOM // 2
+        x, y = ((self.state.target_corner[lane] - PAD) * DEBUG_ZOOM + radius).tolist()
+        frame[ring(len(frame), x, y, radius, 2 * DEBUG_ZOOM)] = GREEN

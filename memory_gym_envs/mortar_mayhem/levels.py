@@ -96,12 +96,6 @@ def write_level(s: State, lane: int, level: Level, variant: MortarVariant) -> No
         s.clue_step[lane] = 0
         s.symbol[lane] = s.clue[lane, 0]
     else:
-        write_command_vector(s, lane, level.commands)
-
-
-def write_command_vector(s: State, lane: int, commands: list[int]) -> None:
-    """Writes the commands as one-hot rows, in the order of VECTOR_ORDER."""
-    vector = s.vector[lane]  # (180,)
-    vector.fill(0.0)
-    for step, command in enumerate(commands):
-        vector[len(COMMANDS) * step + VECTOR_INDEX[command]] = 1.0
+        s.vector[lane] = 0.0
+        for step, command in enumerate(level.commands):
+            s.vector[lane, len(COMMANDS) * step + VECTOR_INDEX[command]] = 1.0

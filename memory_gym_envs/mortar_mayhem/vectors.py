@@ -7,24 +7,16 @@ from functools import cache, lru_cache
 
 import numpy as np
 
-from memory_gym_envs.appearance import CORNERS, AppearanceTables, VectorTables, View, tables_of, vector_tables
+from memory_gym_envs.appearance import CORNERS, AppearanceTables, VectorTables, View, tables_of
 from memory_gym_envs.character import FACINGS, PAD, Figure, sprites
 from memory_gym_envs.drawing import SCREEN, read_only
 from memory_gym_envs.mortar_mayhem.arena import ARENA_SIZES, COMMANDS, FLOORS, TILE, first_pixel, tile_tables
 from memory_gym_envs.mortar_mayhem.drawing import SYMBOL, SYMBOL_AT, symbols
-from memory_gym_envs.mortar_mayhem.options import MortarVariant
 from memory_gym_envs.mortar_mayhem.state import State
 from memory_gym_envs.state import Lanes
 
 # (10, 9) a command as one-hot, for every symbol; BLANK: zeros
 COMMAND_ENTRIES = read_only(np.eye(1 + len(COMMANDS), dtype=np.float32)[:, 1:])
-
-
-def make_vector_tables(variant: MortarVariant, figures: tuple[Figure, ...], figure: np.ndarray) -> VectorTables:
-    """The tables for lanes whose agents are figures[figure], figure (N,)."""
-    views = len(symbols()) if variant.clue else 1  # of each figure
-    appearance, scales = appearance_tables(figures, variant.clue), [each.scale for each in figures]
-    return vector_tables(variant.entries, appearance, figure * (views * FACINGS), scales, TILE)
 
 
 @lru_cache(maxsize=16)

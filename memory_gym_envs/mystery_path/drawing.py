@@ -151,33 +151,27 @@ def spent_stamina(s: State, lanes: Lanes) -> np.ndarray:
 
 def draw(s: State, sheet: Sheet, lanes: Lanes, endless: bool) -> np.ndarray:
     """Fresh frames of the lanes, (n, 84, 84, 3) uint8, from the state alone. sheet: of the agents."""
-    frames = draw_endless_ground(s, lanes) if endless else draw_ground(s, lanes)  # (n, FRAME)
+    frames = draw_ground(s, lanes, endless)  # (n, FRAME)
     draw_agent(frames, s, sheet, lanes, endless)
     return frames.reshape(-1, SCREEN, SCREEN, 3)
 
 
-def draw_ground(s: State, lanes: Lanes) -> np.ndarray:
-    """(n, FRAME): black, with the path's origin and goal where they are shown."""
-    frames = np.zeros((len(s.last_path_step[lanes]), FRAME), np.uint8)
-    if not np.count_nonzero(s.extras[lanes]):
-        return frames
-    for shown, kind in ((s.show_origin[lanes], ORIGIN), (s.show_goal[lanes], GOAL)):
-        if np.count_nonzero(shown):
-            (which,) = shown.nonzero()
-            step = s.path_length[lanes][which] if kind == GOAL else 1
-            cell = s.path_cell[lanes][which, step]
-            paste(frames, tiles(), np.full(len(which), kind), tile_centres(cell), which)
-    return frames
-
-
-def draw_endless_ground(s: State, lanes: Lanes) -> np.ndarray:
-    """(n, FRAME): black or the background, and the trail where it is shown."""
-    if np.count_nonzero(s.extras[lanes]):
+def draw_ground(s: State, lanes: Lanes, endless: bool) -> np.ndarray:
+    """(n, FRAME): black or the background, and what is shown of the path: its trail, or its origin and goal."""
+    extras = np.count_nonzero(s.extras[lanes])
+    if endless and extras:
         frames = grounds().take(ground_rows(s, lanes), axis=0)
     else:
         frames = np.zeros((len(s.last_path_step[lanes]), FRAME), np.uint8)
-    if np.count_nonzero(s.shows_trail[lanes]):
+    if endless and np.count_nonzero(s.shows_trail[lanes]):
         draw_trail(frames, s, lanes)
+    if extras and not endless:
+        for shown, kind in ((s.show_origin[lanes], ORIGIN), (s.show_goal[lanes], GOAL)):
+            (which,) = shown.nonzero()
+            if which.size:
+                step = s.path_length[lanes][which] if kind == GOAL else 1
+                cell = s.path_cell[lanes][which, step]
+                paste(frames, tiles(), np.full(len(which), kind), tile_centres(cell), which)
     return frames
 
 
@@ -212,7 +206,7 @@ def draw_agent(frames: np.ndarray, s: State, sheet: Sheet, lanes: Lanes, endless
 def draw_truth(s: State, sheet: Sheet, lane: int, endless: bool) -> np.ndarray:
     """The lane's frame with its path, (84, 84, 3) uint8: what the debug view enlarges."""
     one = np.array([lane])
-    frames = draw_endless_ground(s, one) if endless else draw_ground(s, one)  # (1, FRAME)
+    frames = draw_ground(s, one, endless)  # (1, FRAME)
     steps = int(s.path_length[lane])
     path = s.path_cell[lane, 1 : steps + 1].tolist()
     marks = [(cell, ORIGIN if cell // ROWS % SEGMENT == SIDE else ON_PATH) for cell in path]

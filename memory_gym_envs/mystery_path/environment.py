@@ -5,9 +5,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from memory_gym_envs.appearance import VectorTables
+from memory_gym_envs.appearance import VectorTables, vector_tables
 from memory_gym_envs.base import DEBUG_ZOOM
-from memory_gym_envs.character import PAD, Figure, radius_of
+from memory_gym_envs.character import FACINGS, PAD, Figure, radius_of
 from memory_gym_envs.drawing import SCREEN, magnify
 from memory_gym_envs.mystery_path import drawing, levels, rules, vectors
 from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE, VARIANTS
@@ -118,21 +118,22 @@ class MysteryPath(WalkingVectorEnv):
         self._index_lanes()
 
     def _index_lanes(self) -> None:
-        """Finds where each lane's cells and steps start in the flattened state."""
+        """Computes where each lane's cells and steps start in the flattened state, which may have grown."""
         self._lane_map = np.arange(self.num_envs) * self.state.step_at.shape[1] + PIT_ROWS  # (N,)
         self._lane_path = np.arange(self.num_envs) * self.state.path_cell.shape[1]  # (N,)
 
     def vector_tables(self) -> VectorTables:
         """The tables of vector observations."""
-        return vectors.make_vector_tables(self.variant, self.view_options, self.state.view)
+        appearance, scales = vectors.appearance_tables(self.view_options), [view.scale for view in self.view_options]
+        return vector_tables(self.variant.entries, appearance, self.state.view * (2 * FACINGS), scales, TILE)
 
     def begin(self, lanes: np.ndarray) -> None:
         """Samples the lanes' next levels and starts their episodes."""
         rules.forget_trails(self.state, lanes)
         for lane in lanes.tolist():
             level = levels.sample_level(self._rngs[lane], self.settings[lane], self.variant)
-            if levels.write_level(self.state, lane, level, self.variant.endless):
-                self._index_lanes()
+            levels.write_level(self.state, lane, level, self.variant.endless)
+        self._index_lanes()
 
     def apply_rules(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Walks, and enters a tile or falls off: rewards and terminations, (N,) each."""
@@ -162,11 +163,10 @@ class MysteryPath(WalkingVectorEnv):
         """Appends a segment to the paths whose last segment the agent just entered."""
         s = self.state
         entered = s.tile[:, 0] >= (s.segments - 1) * SEGMENT
-        if not np.count_nonzero(entered):
-            return
-        for lane in np.flatnonzero(entered).tolist():
-            if levels.append_segment(s, lane, self._rngs[lane]):
-                self._index_lanes()
+        if np.count_nonzero(entered):
+            for lane in np.flatnonzero(entered).tolist():
+                levels.append_segment(s, lane, self._rngs[lane])
+            self._index_lanes()
 
     def vectors(self, lanes: Lanes) -> np.ndarray:
         """Fresh vector observations of the lanes, (n, V) float32."""

@@ -11,18 +11,8 @@ import numpy as np
 
 from memory_gym_envs.character import PAD
 from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE
-from memory_gym_envs.mystery_path.state import (
-    DIRECTIONS,
-    EAST,
-    NO_STEP,
-    ORIGIN,
-    PIT,
-    PIT_ROWS,
-    ROWS,
-    UNREWARDED,
-    State,
-    make_path_room,
-)
+from memory_gym_envs.mystery_path.state import DIRECTIONS, EAST, NO_STEP, ORIGIN, PIT, PIT_ROWS, ROWS, UNREWARDED, State
+from memory_gym_envs.state import make_room
 from memory_gym_envs.variant import Variant
 from memory_gym_envs.words import WordBuffer, pick, sample_below
 
@@ -175,9 +165,8 @@ def cells_of(nodes: list[int], segment: int) -> list[int]:
     return [CELLS[node] + shift for node in nodes]
 
 
-def write_level(s: State, lane: int, level: Level, endless: bool) -> bool:
-    """Starts the lane's episode at this level. Returns whether the state's arrays had to be widened."""
-    widened = make_path_room(s, len(level.path), len(level.walls))
+def write_level(s: State, lane: int, level: Level, endless: bool) -> None:
+    """Starts the lane's episode at this level, for which the state may have to grow."""
     s.step_at[lane] = PIT
     s.fell_at[lane] = s.walls[lane] = s.fallen[lane] = s.shows_cross[lane] = False
     s.path_length[lane] = s.segments[lane] = s.max_column[lane] = s.fails[lane] = s.visited[lane] = 0
@@ -197,13 +186,13 @@ def write_level(s: State, lane: int, level: Level, endless: bool) -> bool:
     s.path_step[lane], s.last_path_step[lane] = NO_STEP, ORIGIN  # the first step lands on it
     s.next_direction[lane] = s.direction_at[lane, ORIGIN]
     s.stamina[lane] = s.stamina_level[lane]
-    return widened
 
 
 def write_path(s: State, lane: int, level: Level, endless: bool) -> None:
-    """Appends to the lane's path, for which there must be room."""
-    first = int(s.path_length[lane]) + 1
+    """Appends to the lane's path, for which the state may have to grow."""
+    first, segments = int(s.path_length[lane]) + 1, int(s.segments[lane])
     last = first + len(level.path)
+    make_path_room(s, last, segments + len(level.walls))
     s.path_cell[lane, first:last] = level.path
     path = s.path_cell[lane, first:last]
     s.step_at[lane][path] = np.arange(first, last)
@@ -211,18 +200,24 @@ def write_path(s: State, lane: int, level: Level, endless: bool) -> None:
     # After a transition tile the path goes on to the right. At the goal, the direction is the one that leads to it.
     s.direction_at[lane, last - 1] = EAST if endless else s.direction_at[lane, last - 2]
     s.path_length[lane] = last - 1
-    for segment, walls in enumerate(level.walls, int(s.segments[lane])):
+    for segment, walls in enumerate(level.walls, segments):
         s.walls[lane, cells_of(walls, segment)] = True
     s.segments[lane] += len(level.walls)
 
 
-def append_segment(s: State, lane: int, rng: np.random.Generator) -> bool:
-    """Appends a segment to the lane's endless path. Returns whether the state's arrays had to be widened."""
-    steps, segments = int(s.path_length[lane]), int(s.segments[lane])
-    row = int(s.path_cell[lane, steps]) % ROWS - PIT_ROWS
+def make_path_room(s: State, steps: int, segments: int) -> None:
+    """Widens the state if it cannot hold so many steps, PIT included, and segments."""
+    room = s.fell_at.shape[1] // (SEGMENT * ROWS)
+    if steps > s.path_cell.shape[1] or segments > room:
+        # At least by half, so that a path that grows for long seldom has to be copied.
+        make_room(s, "P", max(steps, s.path_cell.shape[1] * 3 // 2))
+        make_room(s, "M", max(segments, room * 3 // 2) * SEGMENT * ROWS)
+
+
+def append_segment(s: State, lane: int, rng: np.random.Generator) -> None:
+    """Appends a segment to the lane's endless path, for which the state may have to grow."""
     buffer = read_ahead(rng, 1)
-    level = sample_segments(buffer, row, segments, 1)
+    row = int(s.path_cell[lane, s.path_length[lane]]) % ROWS - PIT_ROWS
+    level = sample_segments(buffer, row, int(s.segments[lane]), 1)
     buffer.close()
-    widened = make_path_room(s, steps + len(level.path), segments + 1)
     write_path(s, lane, level, endless=True)
-    return widened

@@ -57,7 +57,11 @@ def enter_tiles(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: b
         # The ground truth has no entry for the west.
         np.copyto(direction, s.next_direction, where=direction == WEST)
         s.shows_trail = s.show_past & (s.tile[:, 0] > 0)
-        update_trails(s, lane_path)
+        (lanes,) = s.shows_trail.nonzero()
+        if lanes.size:
+            s.trail_lane, cell = trail(s, lanes, lane_path)
+            column, row = np.divmod(cell, ROWS)
+            s.trail_x, s.trail_y = column * TILE, (row - PIT_ROWS) * TILE
     s.next_direction = direction
 
 
@@ -69,33 +73,17 @@ def spend_stamina(s: State, cell: np.ndarray, landed: int) -> np.ndarray:
     if not landed:
         s.stamina -= 1
         return s.stamina == 0
-    over = fatal_falls(s, cell) if np.count_nonzero(s.fallen) else False
+    over: np.ndarray | bool = False
+    if np.count_nonzero(s.fallen):
+        over = s.fallen & ((s.tile[:, 0] < s.max_column) | s.fell_at.take(cell))
+        # Marked for the whole episode. The original would clear the marks on progress, but compares too early.
+        s.fell_at.put(cell[s.fallen], True)
     s.max_column = np.where(s.fallen, s.max_column, np.maximum(s.max_column, s.tile[:, 0]))
     s.stamina -= 1
     return (s.stamina == 0) | over
 
 
-def fatal_falls(s: State, cell: np.ndarray) -> np.ndarray:
-    """The endless id: which agents fell off where that ends the episode, (N,) bool.
-
-    cell: (N,) the agents' cells in the flattened map.
-    """
-    over = s.fallen & ((s.tile[:, 0] < s.max_column) | s.fell_at.take(cell))
-    # These are kept for the whole episode. The original would clear them on progress, but compares too early.
-    s.fell_at.put(cell[s.fallen], True)
-    return over
-
-
 # ---- trails ----
-
-
-def update_trails(s: State, lane_path: np.ndarray) -> None:
-    """Finds the path behind the agents that is shown. lane_path: as in `enter_tiles`."""
-    (lanes,) = s.shows_trail.nonzero()
-    if lanes.size:
-        s.trail_lane, cell = trail(s, lanes, lane_path)
-        column, row = np.divmod(cell, ROWS)
-        s.trail_x, s.trail_y = column * TILE, (row - PIT_ROWS) * TILE
 
 
 def trail(s: State, lanes: np.ndarray, lane_path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

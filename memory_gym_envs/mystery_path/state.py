@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from memory_gym_envs.mystery_path.options import SEGMENT, SIDE
-from memory_gym_envs.state import array, make_room
+from memory_gym_envs.mystery_path.options import SIDE
+from memory_gym_envs.state import array
 from memory_gym_envs.walking import WalkingState
 
 # Rows of pit above and below the screen. Nothing stops the agent there in the endless id; the largest and fastest one
@@ -91,14 +91,3 @@ class State(WalkingState):
     reward_progress: np.ndarray = array("N", dtype=np.float64, option="reward_path_progress")
     reward_dense: np.ndarray = array("N", dtype=np.float64, option="reward_path_progress_dense")
     reward_step: np.ndarray = array("N", dtype=np.float64, option="reward_step")
-
-
-def make_path_room(s: State, steps: int, segments: int) -> bool:
-    """Widens the state if it cannot hold a path of so many steps and segments. Returns whether it had to."""
-    room = s.fell_at.shape[1] // (SEGMENT * ROWS)
-    if steps < s.path_cell.shape[1] and segments <= room:
-        return False
-    # At least by half, so that a path that grows for long seldom has to be copied.
-    make_room(s, "P", max(steps + 1, s.path_cell.shape[1] * 3 // 2))
-    make_room(s, "M", max(segments, room * 3 // 2) * SEGMENT * ROWS)
-    return True

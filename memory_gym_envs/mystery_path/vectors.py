@@ -8,15 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memory_gym_envs.appearance import CORNERS, AppearanceTables, VectorTables, View, tables_of, vector_tables
+from memory_gym_envs.appearance import CORNERS, AppearanceTables, VectorTables, View, tables_of
 from memory_gym_envs.character import FACINGS, LARGEST_RADIUS, PAD, PIXELS, SPAN, sprites
-from memory_gym_envs.drawing import RED, SCREEN
+from memory_gym_envs.drawing import RED, SCREEN, with_margin
 from memory_gym_envs.mystery_path import drawing
 from memory_gym_envs.mystery_path.drawing import CROSS, STAMINA_BAR
 from memory_gym_envs.mystery_path.options import SIDE, TILE
 from memory_gym_envs.mystery_path.state import State
 from memory_gym_envs.state import Lanes
-from memory_gym_envs.variant import Variant
 
 CROSS_ROW_FITS = abs(PIXELS - SCREEN // 2) < (SCREEN + CROSS) // 2  # of stored positions along y
 
@@ -38,12 +37,6 @@ def view_options_of(values: dict[str, Any], scale: float, endless: bool) -> View
     return ViewOptions(scale, figure_x, cross_x - figure_x, SCREEN - STAMINA_BAR * values["show_stamina"])
 
 
-def make_vector_tables(variant: Variant, view_options: tuple[ViewOptions, ...], view: np.ndarray) -> VectorTables:
-    """The tables for lanes with view_options[view], view (N,)."""
-    scales = [options.scale for options in view_options]
-    return vector_tables(variant.entries, appearance_tables(view_options), view * (2 * FACINGS), scales, TILE)
-
-
 @lru_cache(maxsize=16)
 def appearance_tables(view_options: tuple[ViewOptions, ...]) -> AppearanceTables:
     """What can be seen of the agent with each of these view options, without a cross and with one."""
@@ -62,8 +55,7 @@ def appearance_tables(view_options: tuple[ViewOptions, ...]) -> AppearanceTables
 def with_cross(image: np.ndarray, solid: np.ndarray, aside: int) -> tuple[np.ndarray, np.ndarray]:
     """The figure's sprites (8, W, W, 3) and masks (8, W, W) with a cross, so many pixels right of their middle."""
     margin = max(0, CROSS // 2 + abs(aside) - solid.shape[1] // 2)
-    around = ((0, 0), (margin, margin), (margin, margin))
-    image, solid = np.pad(image, (*around, (0, 0))), np.pad(solid, around)
+    image, solid = with_margin(image, margin), with_margin(solid, margin)
     first = solid.shape[1] // 2 - CROSS // 2
     square = (slice(None), slice(first, first + CROSS), slice(first + aside, first + aside + CROSS))
     image[square][:, drawing.cross_mask()], solid[square][:, drawing.cross_mask()] = RED, True

@@ -203,7 +203,8 @@ class DrawingTables(NamedTuple):
 def draw(s: State, drawing: DrawingTables, lanes: Lanes) -> np.ndarray:
     """Fresh frames of the lanes, (n, 84, 84, 3) uint8, drawn from the state alone."""
     dim = (s.length < s.dark_at)[lanes]  # (n,) the darkness is not just black
-    frames = draw_in_full_light(s, drawing, lanes, s.near_light[lanes] | dim)
+    frames = s.scenery.take(s.floor[lanes], axis=0)  # (n, FRAME), in full light
+    draw_agents(s, drawing, lanes, frames, s.near_light[lanes] | dim)
     lit, rim = light_masks(s, drawing.spots, lanes)
     darken(s, lanes, frames, pixels(lit, drawing.scratch[: len(lit)]), rim, np.flatnonzero(dim))
     coins = s.coin_age[lanes] < s.coin_show_limit[lanes]
@@ -221,13 +222,6 @@ def draw(s: State, drawing: DrawingTables, lanes: Lanes) -> np.ndarray:
 def bar_rows(s: State, lanes: Lanes) -> np.ndarray:
     """(n,) which of bars() the lanes show."""
     return s.first_bar[lanes] + (3 * s.shown_action[lanes] + s.shown_gain[lanes]) * WIDTHS + s.lost_width[lanes]
-
-
-def draw_in_full_light(s: State, drawing: DrawingTables, lanes: Lanes, seen: np.ndarray | bool) -> np.ndarray:
-    """The lanes in full light: (n, FRAME) uint8. seen: (n,) bool which agents are drawn; True: all."""
-    frames = s.scenery.take(s.floor[lanes], axis=0)
-    draw_agents(s, drawing, lanes, frames, seen)
-    return frames
 
 
 def draw_scenery(s: State, drawing: DrawingTables, lane: int) -> None:

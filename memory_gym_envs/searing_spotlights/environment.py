@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from memory_gym_envs.base import DEBUG_ZOOM, NO_LIMIT
+from memory_gym_envs.base import DEBUG_ZOOM
 from memory_gym_envs.bits import POSITION_0, POSITIONS, pixel_scratch
 from memory_gym_envs.character import PAD, Figure
 from memory_gym_envs.drawing import GREEN, SCREEN, magnify, ring
@@ -14,7 +14,7 @@ from memory_gym_envs.searing_spotlights.options import VARIANTS
 from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, RADIUS, State
 from memory_gym_envs.state import Lanes, empty, make_room
 from memory_gym_envs.walking import WalkingVectorEnv, numbered
-from memory_gym_envs.words import word_source
+from memory_gym_envs.words import pick, word_source
 
 
 class SearingSpotlights(WalkingVectorEnv):
@@ -144,9 +144,8 @@ class SearingSpotlights(WalkingVectorEnv):
         """Samples the lanes' next levels and starts their episodes."""
         for lane in lanes.tolist():
             values = self.settings[lane]
-            spawns = NO_LIMIT if self.variant.endless else values["num_spawns"]
             level = levels.sample_level(self._rngs[lane], values, self.variant)
-            levels.write_level(self.state, lane, level, spawns, rules.coin_show_limit(values, first=True))
+            levels.write_level(self.state, lane, level, values)
             self._draw_scenery(lane)
             if not level.coins:
                 self._unlocked.append(lane)
@@ -191,7 +190,7 @@ class SearingSpotlights(WalkingVectorEnv):
         if np.count_nonzero(due):
             for lane in np.flatnonzero(due).tolist():
                 rng, values = self._rngs[lane], self.settings[lane]
-                rules.add_spot(s, lane, levels.sample_spot(rng, values), levels.sample_delay(rng, values))
+                rules.add_spot(s, lane, levels.sample_spot(rng, values), pick(word_source(rng), values["spawn_delay"]))
 
     def _collect(self, touched: np.ndarray, rewards: np.ndarray) -> dict[int, float]:
         """Takes the coins that are touched, (N, B) bool; the endless id then has a new one.
@@ -206,7 +205,7 @@ class SearingSpotlights(WalkingVectorEnv):
             rewards[lane] += s.reward_coin[lane] * rules.take_coins(s, lane, touched[lane])
             if self.variant.endless:
                 coin = levels.sample_coin(word_source(self._rngs[lane]), last)
-                rules.put_coin(s, lane, coin, rules.coin_show_limit(values, first=False))
+                rules.put_coin(s, lane, coin, values)
             self._draw_scenery(lane)
         return shown
 
@@ -263,7 +262,8 @@ class SearingSpotlights(WalkingVectorEnv):
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Lights everything below the bar, and circles the spotlights."""
         s, lanes = self.state, np.array([lane])
-        lit = drawing.draw_in_full_light(s, self._drawing, lanes, True)
+        lit = s.scenery.take(s.floor[lanes], axis=0)  # (1, FRAME)
+        drawing.draw_agents(s, self._drawing, lanes, lit, True)
         below = slice(TOP_BAR * DEBUG_ZOOM, None)
         frame[below] = magnify(lit.reshape(SCREEN, SCREEN, 3), DEBUG_ZOOM)[below]
         for slot in np.flatnonzero(s.spot_place[0, lane]).tolist():

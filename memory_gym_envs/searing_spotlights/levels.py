@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from memory_gym_envs.base import NO_LIMIT
 from memory_gym_envs.bits import POSITION_0, POSITIONS
 from memory_gym_envs.character import FACINGS, PAD, hand_offsets, radius_of
 from memory_gym_envs.drawing import SCREEN
-from memory_gym_envs.searing_spotlights.rules import start_wait, update_targets
+from memory_gym_envs.searing_spotlights.rules import coin_show_limit, start_wait, update_targets
 from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, NO_KEY, NO_SPOT, RADIUS, State
 from memory_gym_envs.state import make_room
 from memory_gym_envs.variant import Variant
@@ -50,14 +51,14 @@ def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Vari
     spots = [sample_spot(rng, values) for _ in range(values["initial_spawns"])]
     if variant.endless:
         coin = [sample_coin(next_word, None)] if values["coin_enabled"] else []
-        return Level(facing, pos, spots, coin, None, sample_delay(rng, values))
+        return Level(facing, pos, spots, coin, None, pick(next_word, values["spawn_delay"]))
     things = []
     coins = pick(next_word, values["num_coins"]) if values["num_coins"] else 0
     for _ in range(coins + values["use_exit"]):
         position, free = sample_position(next_word, free, COIN_SPACE)
         things.append(inside(position))
     exit_ = things.pop() if values["use_exit"] else None
-    return Level(facing, pos, spots, things, exit_, sample_delay(rng, values))
+    return Level(facing, pos, spots, things, exit_, pick(next_word, values["spawn_delay"]))
 
 
 def sample_position(next_word: Callable[[], int], free: np.ndarray | None, space: int) -> tuple[Position, np.ndarray]:
@@ -119,11 +120,6 @@ def sample_spot(rng: np.random.Generator, values: dict[str, Any]) -> list[float]
     return [0.0, speed, radius, reach * reach, sight * sight, *path]
 
 
-def sample_delay(rng: np.random.Generator, values: dict[str, Any]) -> int:
-    """The steps added to the next interval between spotlights. A list of one takes no draw."""
-    return pick(word_source(rng), values["spawn_delay"])
-
-
 @cache
 def _extent(scale: float) -> float:
     """How far from the agent's centre a spotlight may end and still show some of it, in pixels."""
@@ -142,11 +138,8 @@ def _unit(degrees: int) -> tuple[float, float]:
 UNITS = [_unit(degrees) for degrees in range(720)]
 
 
-def write_level(s: State, lane: int, level: Level, spawns: int, show_limit: int) -> None:
-    """Starts the lane's episode at this level.
-
-    spawns: how many spotlights will follow. show_limit: age until which coins are visible in the dark, in steps.
-    """
+def write_level(s: State, lane: int, level: Level, values: dict[str, Any]) -> None:
+    """Starts the lane's episode at this level, with these reset options."""
     coins, spots = len(level.coins), len(level.spots)
     if spots > s.spot_key.shape[1]:
         make_room(s, "S", spots)
@@ -164,14 +157,14 @@ def write_level(s: State, lane: int, level: Level, spawns: int, show_limit: int)
     if level.exit is not None:
         s.bodies[:, lane, EXIT] = s.targets[lane, 2:] = level.exit
     s.num_coins[lane] = s.coins_left[lane] = coins
-    s.coin_show_limit[lane] = show_limit
+    s.coin_show_limit[lane] = coin_show_limit(values, first=True)
     update_targets(s, lane)
     s.spots[:, lane], s.spot_key[lane], s.num_spots[lane] = NO_SPOT[:, None], NO_KEY, spots
     if spots:
         s.spots[:, lane, :spots] = np.array(level.spots).T
         s.spot_key[lane, :spots] = [spot[RADIUS] * POSITIONS + POSITION_0 for spot in level.spots]
     s.spot_place[:, lane], s.near_light[lane] = 0, False  # they shine from the first step on
-    s.spawns_left[lane] = spawns
+    s.spawns_left[lane] = values.get("num_spawns", NO_LIMIT)
     start_wait(s, lane, level.delay)
     s.health[lane] = s.full_health[lane]
     s.floor[lane] = 2 * lane

@@ -159,10 +159,10 @@ def coin_show_limit(values: dict[str, Any], first: bool) -> int:
     return values.get("coin_show_duration", 0) if first or values["coin_feedback"] else 0
 
 
-def put_coin(s: State, lane: int, coin: tuple[int, int], show_limit: int) -> None:
-    """Puts the endless task's next coin there, x and y in pixels. show_limit: as in write_level."""
+def put_coin(s: State, lane: int, coin: tuple[int, int], values: dict[str, Any]) -> None:
+    """Puts the endless task's next coin there, x and y in pixels."""
     s.bodies[:, lane, COIN] = coin
-    s.coins_left[lane], s.coin_age[lane], s.coin_show_limit[lane] = 1, 0, show_limit
+    s.coins_left[lane], s.coin_age[lane], s.coin_show_limit[lane] = 1, 0, coin_show_limit(values, first=False)
     update_targets(s, lane)
 
 
