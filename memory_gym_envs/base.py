@@ -75,21 +75,13 @@ LANE_BY_LANE: dict[str, tuple[str, Callable[[Any], bool]]] = {
 class MemoryGymVectorEnv(Saved, VectorEnv):
     """N environments of one id, stepped together.
 
-    Arguments:
+    Arguments, in addition to what SHARED_DOC says of them:
         variant: the id, a key of the family's `variants`.
         num_envs: N, at least 1.
-        render_mode: None, "rgb_array" (what the agent sees) or "debug_rgb_array" (larger, with the ground truth).
-        num_levels: with n > 0, every reset without a seed, automatic ones too, plays a level sampled from n; None or 0:
-            no limit. A level is what `reset(seed=level)` builds.
-        start_level: the first of those n levels.
-        obs_type: "pixels" (the id's own observation space), "grayscale" (the same with pictures of one channel, their
-            luminance) or "vector": a flat (V,) float32 vector of what the frame shows, and of nothing that it hides; no
-            frame is drawn then. `variant.entries` says what is in it.
-        action_type: "native" (the id's own action space) or "discrete": one number of nine where the id has two of
-            three, 3 times the first plus the second.
-        options: reset parameters that are this environment's defaults, for resets that do not give them.
-        autoreset_mode: when an episode that ends is reset: in the same step, in the next one, or by the caller.
-        max_episode_steps: truncates longer episodes, as `gym.make(id, max_episode_steps=...)` does.
+        num_levels: 0 is as None. A level is what `reset(seed=level)` builds; automatic resets sample one, too.
+        obs_type: "grayscale" is the luminance. A "vector" has what the frame shows, and nothing that it hides; no frame
+            is drawn then.
+        action_type: a "discrete" action is 3 times the first of the two, plus the second.
 
     Raises ValueError for any other argument value.
 
@@ -364,10 +356,9 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         """Raises ValueError if the state is of one made with other arguments, or has not what every lane needs."""
         theirs = state["made_with"]
         for name in self.arguments | theirs:
-            if theirs.get(name) != self.arguments.get(name):
-                raise ValueError(
-                    f"the saved state is of one with {name} {theirs.get(name)!r}, not {self.arguments.get(name)!r}"
-                )
+            given, ours = theirs.get(name), self.arguments.get(name)
+            if given != ours:
+                raise ValueError(f"the saved state is of one with {name} {given!r}, not {ours!r}")
         for name in self.kept:
             given, ours = state[name], plain(getattr(self, name))
             if type(given) is not type(ours) or getattr(given, "dtype", None) != getattr(ours, "dtype", None):

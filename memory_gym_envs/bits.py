@@ -33,7 +33,7 @@ class Stencils(NamedTuple):
     (K * POSITIONS,) are looked up by shape * POSITIONS + POSITION_0 + x, or y.
     """
 
-    windows: np.ndarray  # (rows,) by their first row on the strip: one opaque item each
+    windows: np.ndarray  # (rows,) by their first row on the strip: one opaque item each, a view of the strip
     column: np.ndarray  # where on the strip the shape starts, for every x
     row: np.ndarray  # how far from there the window starts, for every y
 
@@ -50,7 +50,7 @@ def stencils(shapes: Sequence[np.ndarray], height: int = SCREEN) -> Stencils:
 
 def subsample_stencils(shapes: Sequence[np.ndarray]) -> Stencils:
     """Subsamples of (W, W) shapes, W even."""
-    return _stencils(shapes, _packed_subsample, ROW_STEP, SUBSAMPLE_ROWS)
+    return _stencils(shapes, subsampled_rows, ROW_STEP, SUBSAMPLE_ROWS)
 
 
 def _stencils(shapes: Sequence[np.ndarray], pack: Callable, step: int, height: int) -> Stencils:
@@ -68,7 +68,10 @@ def _stencils(shapes: Sequence[np.ndarray], pack: Callable, step: int, height: i
             column[index, seen] = end + step * part[index] * (first[index, seen] + len(shape) - 1)
             strip.append(_every_x(shape, pack, step, height))
             end += len(strip[-1])
-    return Stencils(row_windows(np.concatenate(strip), height), column.reshape(-1), row.reshape(-1))
+    rows = np.concatenate(strip)  # (rows, items)
+    window = np.dtype(f"V{rows[:height].nbytes}")
+    windows = np.ndarray((len(rows) - height + 1,), window, rows, 0, rows.strides[:1])
+    return Stencils(windows, column.reshape(-1), row.reshape(-1))
 
 
 def _every_x(shape: np.ndarray, pack: Callable, step: int, height: int) -> np.ndarray:
@@ -90,24 +93,13 @@ def unpacked(items: np.ndarray) -> np.ndarray:
     return (items[..., None] >> np.arange(ITEM, dtype=np.uint16) & 1).astype(bool).reshape(*items.shape[:-1], SCREEN)
 
 
-def subsample(pixels: np.ndarray) -> np.ndarray:
-    """The subsample of a frame's pixels (84, 84) bool: (42,) uint64."""
-    return _packed_subsample(pixels[::ROW_STEP])[:, 0]
-
-
-def _packed_subsample(pixels: np.ndarray) -> np.ndarray:
+def subsampled_rows(pixels: np.ndarray) -> np.ndarray:
     """Rows of pixels (..., 84) bool as one number each, (..., 1) uint64."""
     eights = pixels.reshape(*pixels.shape[:-1], ITEMS, ITEM)[..., SUBSAMPLE_COLUMNS]
     lines = np.packbits(eights, axis=-1, bitorder="little")[..., 0]  # (..., 7)
     rows = np.zeros((*lines.shape[:-1], 8), np.uint8)
     rows[..., :ITEMS] = lines
     return rows.view(np.uint64)
-
-
-def row_windows(strip: np.ndarray, height: int) -> np.ndarray:
-    """Every window of so many rows of a strip (rows, items), by its first row: one opaque item each, a view."""
-    size = strip.shape[1] * strip.itemsize
-    return np.ndarray((len(strip) - height + 1,), np.dtype(f"V{size * height}"), strip, 0, (size,))
 
 
 @cache

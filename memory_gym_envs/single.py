@@ -110,9 +110,8 @@ class MemoryGymEnv(gym.Env):
 
     def oracle(self) -> dict[str, Any]:
         """The whole task in plain numbers and arrays, hidden or not, as the family's `oracle` names them."""
-        return {
-            name: values[0].item() if values.ndim == 1 else values[0] for name, values in self.batch.oracle().items()
-        }
+        numbers = self.batch.oracle()
+        return {name: values[0].item() if values.ndim == 1 else values[0] for name, values in numbers.items()}
 
     @property
     def max_episode_steps(self) -> int:

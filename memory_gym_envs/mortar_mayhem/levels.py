@@ -63,15 +63,11 @@ def sample_walk(next_word: Callable[[], int], tile: int, count: int, size: int, 
 @cache
 def moves_inside(size: int, kinds: int) -> list[list[tuple[int, int]]]:
     """For every tile the commands that stay inside the arena, each with the tile it leads to."""
-    moves = list(enumerate(MOVES[:kinds].tolist()))
+    moves, side = list(enumerate(MOVES[:kinds].tolist())), range(size)
     return [
-        [
-            (command, (x + dx) * size + y + dy)
-            for command, (dx, dy) in moves
-            if 0 <= x + dx < size and 0 <= y + dy < size
-        ]
-        for x in range(size)
-        for y in range(size)
+        [(command, (x + dx) * size + y + dy) for command, (dx, dy) in moves if x + dx in side and y + dy in side]
+        for x in side
+        for y in side
     ]
 
 

@@ -148,11 +148,6 @@ def sample_path(buffer: WordBuffer, walls: list[int], start: int, end: int) -> l
             here, first, opened = first, None, passed
         so_far = cost[here] + 1
     buffer.used = used
-    return trace_back(previous, start, end)
-
-
-def trace_back(previous: list[int], start: int, end: int) -> list[int]:
-    """The nodes from start to end, where previous[node] is the node before each."""
     path = [end]
     while path[-1] != start:
         path.append(previous[path[-1]])

@@ -27,7 +27,7 @@ ROWS_BELOW = np.where(np.arange(0, SCREEN, ROW_STEP) < TOP_BAR, np.uint64(0), FU
 TILE_SHARE = 1 / bits.tile_counts(ROWS_BELOW[None]).astype(np.float32)  # (1, 49)
 FULL_SHARE = TILE_SHARE.min()  # of a tile beside the bar
 BLUE_TILES = (drawing.floors()[BLUE_FLOOR].reshape(SCREEN, SCREEN, 3) == BLUE).all(axis=-1)  # or the red ones
-BLUE_SUBSAMPLE = bits.subsample(BLUE_TILES)  # (42,)
+BLUE_SUBSAMPLE = bits.subsampled_rows(BLUE_TILES[::ROW_STEP])[:, 0]  # (42,)
 NO_BITS = np.uint64(0)
 READING = slice(0, 8)  # the entries that are read from the bar
 # By opacity: (256, 2) all bits where the darkness changes nothing, and where it hides nothing; and the brightness of
