@@ -75,7 +75,7 @@ LANE_BY_LANE: dict[str, tuple[str, Callable[[Any], bool]]] = {
 class MemoryGymVectorEnv(Saved, VectorEnv):
     """N environments of one id, stepped together.
 
-    Arguments, in addition to what SHARED_DOC says of them:
+    Arguments that SHARED_DOC does not explain, or not fully:
         variant: the id, a key of the family's `variants`.
         num_envs: N, at least 1.
         num_levels: 0 is as None. A level is what `reset(seed=level)` builds; automatic resets sample one, too.

@@ -2,8 +2,8 @@
 
 Bits come in two kinds. A mask has one for every pixel: 84 rows of 7 items, an item being 12 neighbouring pixels,
 (84, 7) uint16. A subsample has one for every third pixel: every second row, and 8 of 12 neighbouring pixels as a byte,
-(42,) uint64. The lowest bit is the leftmost pixel. Shape letters: K shapes, n frames, U
-uint64s of a mask or of a subsample.
+(42,) uint64. The lowest bit is the leftmost pixel.
+Shape letters: K shapes, n frames, U uint64s of a mask or a subsample.
 """
 
 from collections.abc import Callable, Sequence

@@ -36,6 +36,7 @@ HELP = "WASD or arrows: move, R: restart, Page Up/Down: seed, Esc: quit"
 
 UP, DOWN, LEFT, RIGHT = "up", "down", "left", "right"
 KEYS = {"w": UP, "s": DOWN, "a": LEFT, "d": RIGHT} | {way: way for way in (UP, DOWN, LEFT, RIGHT)}
+RESTARTS = {"r": 0, "page up": 1, "page down": -1}  # what they add to the seed
 GRID_ACTIONS = {LEFT: 1, RIGHT: 2, UP: 3}  # turn, turn, walk
 PATH_ACTIONS = {RIGHT: 1, UP: 2, DOWN: 3}  # of the endless Mystery Path
 
@@ -66,12 +67,8 @@ class Game:
         if key in KEYS:
             self.held.append(KEYS[key])
             self.tapped.append(KEYS[key])
-        elif key == "r":
-            self.restart(self.seed)
-        elif key == "page up":
-            self.restart(self.seed + 1)
-        elif key == "page down":
-            self.restart(max(self.seed - 1, 0))
+        elif key in RESTARTS:
+            self.restart(max(self.seed + RESTARTS[key], 0))
 
     def release(self, key: str) -> None:
         """Takes in that a key goes up."""
