@@ -21,7 +21,6 @@ With --report nothing is trained, and a claim is not tested if runs are missing.
 """
 
 import itertools
-import re
 import signal
 import sys
 from collections import Counter
@@ -44,7 +43,19 @@ from tables import LEVEL, Comparison
 IN_VIEW = {"command_count": [4], "explosion_delay": [4], "explosion_duration": [2]}
 ALL_VISIBLE = {"agent_visible": True, "coins_visible": True, "exit_visible": True}
 PATH, ENDLESS = suites.SMALL["mystery-path"], suites.SMALL["endless-mortar-mayhem"]
-TASKS = suites.TASKS | {
+EARLY = {  # millions of steps with AdamW
+    "MortarMayhem-v0": 3,
+    "MortarMayhem-Grid-v0": 6,
+    "Endless-MortarMayhem-v0": 6,
+    "MysteryPath-v0": 3,
+    "MysteryPath-Grid-v0": 3,
+    "Endless-MysteryPath-v0": 3,
+    "SearingSpotlights-v0": 3,
+    "Endless-SearingSpotlights-v0": 3,
+}
+TASKS = {
+    **suites.SMALL,
+    **{env_id: Task(env_id, 1_000_000 * millions) for env_id, millions in EARLY.items()},
     "commands-in-view": replace(suites.SMALL["mortar-mayhem"], env_id="MortarMayhemB-Grid-v0", options=IN_VIEW),
     "goal-in-view": replace(PATH, options=PATH.options | {"show_origin": True, "show_goal": True}),
     "all-in-view": Task("SearingSpotlights-v0", 1_000_000, ALL_VISIBLE),
@@ -52,7 +63,8 @@ TASKS = suites.TASKS | {
 }
 # Of a task's aim, what one of a row's agents has, if the task has been learned. Those that fail fall for other reasons.
 SHARE, SHARE_OF_FALLS = 0.25, 0.9
-WIDE_TASKS = {*suites.FULL, "endless-long"}  # here, transformers have about as many parameters as the GRU
+WIDE_TASKS = {*EARLY, "endless-long"}  # here, transformers have about as many parameters as the GRU
+WIDE = "--trxl-dim 96 --trxl-memory-length 256 --init-lr 5e-4"
 
 
 # What is compared, (R, M): of each seed, on each of the development levels, which all runs have.
@@ -103,8 +115,8 @@ class Claim:
     def plans(self, config: learning.Training, agent: str) -> list[learning.Plan]:
         """Return the trainings of one of the agents, one for each seed."""
         name, *own = agent.split(" --", 1)
-        wide = [suites.WIDE] if self.task in WIDE_TASKS and "TrXL" in name else []
-        trained = " ".join([name, *self.flags.split(), *(f"--{flags}" for flags in own), *wide])
+        wide = [WIDE] if self.task in WIDE_TASKS and "TrXL" in name else []
+        trained = " ".join([f"{name}, AdamW", *self.flags.split(), *(f"--{flags}" for flags in own), *wide])
         return [learning.plan(config, TASKS[self.task], trained, seed) for seed in config.seeds]
 
     def numbers(self, runs: list[RunLog]) -> np.ndarray:
@@ -131,8 +143,8 @@ def in_endless(higher: tuple[str, ...], lower: tuple[str, ...], **others) -> Cla
     return Claim("endless-mortar-mayhem", higher, lower, **others)
 
 
-MEMORY, FEW_FRAMES = ("GRU", "TrXL"), ("no memory", "stack of 4", "step encoding")
-NO_MEMORY = (*FEW_FRAMES, "stack of 16")
+MEMORY, FEW_FRAMES = ("GRU", "TrXL"), ("no memory", "4 frames", "step encoding")
+NO_MEMORY = (*FEW_FRAMES, "16 frames")
 GRU, TRXL, LSTM, GTRXL = ("GRU",), ("TrXL",), ("LSTM",), ("GTrXL",)
 QUERY_POSITION, NORMALIZED = "TrXL --trxl-query-position", "GRU --norm-adv minibatch"
 MORTAR_MAYHEMS = "mortar-mayhem MortarMayhem-Grid-v0 MortarMayhem-v0"
@@ -160,12 +172,12 @@ STATEMENTS = (
     Statement(
         "6.2.1 Frames or the step help in the act task",
         "no memory is ineffective",
-        claims_of("frames", "commands-in-view", ("step encoding", "stack of 4", "stack of 16"), ("no memory",)),
+        claims_of("frames", "commands-in-view", ("step encoding", "4 frames", "16 frames"), ("no memory",)),
     ),
     Statement(
         "6.2.1 With its ends shown, 16 frames are enough in Mystery Path",
         "4 frames, step encoding 0.40, no memory 0.11",
-        claims_of("stack", "goal-in-view", ("stack of 16", *MEMORY), FEW_FRAMES),
+        claims_of("stack", "goal-in-view", ("16 frames", *MEMORY), FEW_FRAMES),
     ),
     Statement(
         "6.2.2 TrXL needs fewer samples than GRU in Mortar Mayhem Grid",
@@ -271,7 +283,7 @@ STATEMENTS = (
     Statement(
         "7.1.4 Refreshed memory may help TrXL",
         "not tested",
-        {"stale": in_endless(("TrXL, refreshed",), TRXL)},
+        {"stale": in_endless(("TrXL --refresh-memory",), TRXL)},
     ),
     Statement(
         "7.1.5 Learned or relative positions are no better than absolute ones",
@@ -382,7 +394,7 @@ def holm(p_values: list[float]) -> list[bool]:
 
 def short(agent: str) -> str:
     """Return an agent's name for the table: without TrXL, of which most are variants."""
-    return re.sub(r"^stack of (\d+)", r"\1 frames", suites.short(agent).removeprefix("TrXL, "))
+    return suites.short(agent).removeprefix("TrXL, ")
 
 
 def mean_and_error(numbers: np.ndarray) -> str:
@@ -439,7 +451,7 @@ def main(config: Config) -> None:
         if found < wanted:
             print(f"`{name}` is not tested: {wanted - found} of {wanted} runs are missing")
             continue
-        seeds = [learning.plan(config, TASKS[claim.task], "no memory", seed) for seed in config.seeds]
+        seeds = [learning.plan(config, TASKS[claim.task], "no memory, AdamW", seed) for seed in config.seeds]
         without = finished(config, seeds, results)
         verdicts[name] = judge(claim, runs[name], without if len(without) == len(seeds) else [])
     stars = dict(zip(verdicts, holm([each.p_value for each in verdicts.values()]), strict=True))

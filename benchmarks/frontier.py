@@ -23,16 +23,16 @@ COUNT = 10  # commands of the tasks' default options
 MOST = 0.9  # a command is learned when so many of those who come to it carry it out
 FEWEST = 20  # episodes that a share in the picture is of
 RUNS = {  # what the table and picture call them: task, steps, and the agent of learning.py
-    "GRU, clue and act": ("MortarMayhem-Grid-v0", 6e6, "GRU, Muon"),
-    "transformer, clue and act": ("MortarMayhem-Grid-v0", 6e6, "TrXL, Muon"),
-    "step encoding, act": ("MortarMayhemB-Grid-v0", 6e6, "no memory, Muon --step-encoding"),
-    "GRU that reads the list, act": ("MortarMayhemB-Grid-v0", 3e6, "GRU, laptop"),
+    "GRU, clue and act": ("MortarMayhem-Grid-v0", 6e6, "GRU"),
+    "TrXL+, clue and act": ("MortarMayhem-Grid-v0", 6e6, "TrXL+"),
+    "step encoding, act, list not attended to": ("MortarMayhemB-Grid-v0", 6e6, "step encoding --no-attend-commands"),
+    "GRU, act": ("MortarMayhemB-Grid-v0", 3e6, "GRU"),
 }
 
 
 def reached(task: str, steps: float, agent: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the steps (P,) and how many episodes carried out at least 0 to C commands, (P, C + 1)."""
-    config = learning.Config(suite="laptop", tasks=(task,), steps=int(steps), agents=(agent,), results=RESULTS)
+    config = learning.Config(tasks=(task,), steps=int(steps), agents=(agent,), results=RESULTS)
     (runs,) = learning.results_of(config, learning.plans_of(config))[task].values()
     steps_of, shares = align([run.curves["eval/carried_out"] for run in runs])  # (P,), (P, R, M, E)
     counts = np.rint(COUNT * shares.reshape(len(shares), -1, 1))

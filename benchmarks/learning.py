@@ -87,9 +87,8 @@ class Training:
 class Config(Training):
     """What to train and to draw."""
 
-    suite: Literal["small", "full", "laptop"] = "small"
-    """tasks that are learned within minutes, the ten environments with their default options, or some of these with the
-    agents that --preset laptop trains"""
+    suite: Literal["small", "full"] = "small"
+    """tasks that are learned within minutes, or the ten environments with their default options"""
     tasks: tuple[str, ...] = ()
     """other tasks than the suite's, of those that this program knows"""
     agents: tuple[str, ...] = ()
@@ -105,7 +104,7 @@ class Config(Training):
 
 def file_name(agent: str) -> str:
     """Return an agent's name as part of a file's name."""
-    return re.sub(r"\W+", "-", agent)
+    return re.sub(r"\W+", "-", agent.replace("+", "plus"))
 
 
 @dataclass(frozen=True)
@@ -166,7 +165,8 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
     }
     name, dashes, further = agent.partition(" --")
     script, *memory = AGENTS.get(name, name).split()
-    flags = [*COMMON.split(), *memory, *(task.trxl_flags.split() if "trxl" in script else [])]
+    own = task.trxl_flags if "trxl" in script else task.gru_flags
+    flags = [*COMMON.split(), *memory, *own.split()]
     flags += ["--anneal-steps", str(steps)]
     for each, value in of_the_suite.items():
         flags += [f"--{each.replace('_', '-')}", str(value)]
@@ -198,12 +198,28 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
 
 def runs_in(place: str, plan: Plan) -> list[RunLog]:
     """Return the runs that were planned so among the folders, or the files of results, in a place."""
-    wanted = plan.logged_args()
+    wanted = settings(plan.logged_args())
     found = []
-    for path in sorted(glob.glob(f"{place}/{plan.task.env_id}__{file_name(plan.agent)}__{plan.seed}__*")):
+    for path in sorted(glob.glob(f"{place}/{plan.task.env_id}__*__{plan.seed}__*")):
         with contextlib.suppress(NoCurvesError):
-            found.append(read_run(path))
-    return [run for run in found if {**run.args, "resume": "None"} == wanted]
+            is_file = os.path.isfile(path)  # a folder changes while it is trained
+            found.append(read_file(path, os.stat(path).st_mtime_ns) if is_file else read_run(path))
+    return [run for run in found if settings(run.args) == wanted]
+
+
+@functools.cache
+def read_file(path: str, changed: int) -> RunLog:
+    """Read a file of results: once, as long as it was `changed` at the same time, in nanoseconds."""
+    return read_run(path)
+
+
+def settings(args: dict[str, str]) -> dict[str, str]:
+    """Return the arguments of a run that say how it learned.
+
+    Not its name, nor what it went on from; nor whether it reads lists of commands by attention, where there are none.
+    """
+    ignored = {"exp_name", "resume"} | (set() if "MortarMayhemB" in args["env_id"] else {"attend_commands"})
+    return {name: value for name, value in args.items() if name not in ignored}
 
 
 def result_of(config: Training, plan: Plan) -> RunLog | None:
@@ -422,8 +438,7 @@ def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
     check(config)
     suite_tasks, suite_agents = SUITES[config.suite]
     tasks = config.tasks or suite_tasks
-    of_suite = {short(agent): agent for agent in suite_agents}
-    agents = {short(name): of_suite.get(name.replace(", preset", "+"), name) for name in config.agents} or of_suite
+    agents = {short(name): name for name in config.agents or suite_agents}
     if len(agents) < len(config.agents):
         raise SystemExit(f"two of these agents have the same name in tables: {', '.join(map(short, config.agents))}")
     scripts = {path.name: path for path in ROOT.glob("ppo_*.py")}
@@ -432,7 +447,7 @@ def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"there is no {unknown[0]!r}; there are {'; '.join(known)}")
     return {
-        (task, name, seed): plan(config, suite_tasks.get(task, TASKS[task]), agent, seed)
+        (task, name, seed): plan(config, TASKS[task], agent, seed)
         for task in tasks
         for seed in config.seeds
         for name, agent in agents.items()

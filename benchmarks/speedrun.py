@@ -52,7 +52,7 @@ def row(entry: Entry) -> str:
     Raises SystemExit if a seed has no result, or if they are not above the target: then it is no entry.
     """
     how = {"steps": entry.steps, "seeds": SEEDS, "results": RESULTS}
-    config = learning.Config(suite="laptop", tasks=(entry.task,), agents=(entry.agent,), **how)
+    config = learning.Config(tasks=(entry.task,), agents=(entry.agent,), **how)
     (runs,) = learning.results_of(config, learning.plans_of(config))[entry.task].values()
     if len(runs) < len(SEEDS):
         raise SystemExit(f"{RESULTS} has {len(runs)} of {len(SEEDS)} seeds of {entry.agent} in {entry.task}")

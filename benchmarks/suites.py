@@ -2,56 +2,35 @@
 
 import json
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from ppo_utils.scores import own_metric
 
-# What --preset laptop was when the older results were made.
-EARLY = "--value-init-gain 1 --no-attend-commands"
-# What it was until Muon: the agents of the suites small and full have these settings.
-ADAMW = f"{EARLY} --optimizer adamw --no-norm-reward --num-envs 32 --update-epochs 4 --num-minibatches 8"
-ADAMW += " --init-lr 1e-3 --final-lr 1e-4 --init-ent-coef 5e-4 --final-ent-coef 5e-5"
-GRU = f"ppo_gru.py {ADAMW}"
-BEFORE = "ppo_trxl.py --init-lr 1e-3 --gamma 0.99 --vf-coef 0.5"  # what --preset laptop had for the transformer
-ADAMW_TRXL = f"{BEFORE} {ADAMW} --trxl-num-layers 2 --trxl-dim 64 --trxl-memory-length 128"
-TRXL = f"{ADAMW_TRXL} --no-trxl-query-position --no-trxl-memory-gradient"  # the thesis', where the preset differs
-MEMORIES = {
-    "GRU": f"{GRU} --memory gru",
-    "LSTM": f"{GRU} --memory lstm",
-    "TrXL": TRXL,
-    "GTrXL": f"{TRXL} --trxl-gate gru",
+NO_MEMORY = "ppo_gru.py --memory none"
+PRESET = {  # --preset laptop
+    "no memory": NO_MEMORY,
+    "4 frames": f"{NO_MEMORY} --frame-stack 4",
+    "16 frames": f"{NO_MEMORY} --frame-stack 16",
+    "step encoding": f"{NO_MEMORY} --step-encoding",
+    "GRU": "ppo_gru.py",
+    "LSTM": "ppo_gru.py --memory lstm",
+    "TrXL": "ppo_trxl.py --no-trxl-query-position --no-trxl-memory-gradient",  # the thesis', where the preset differs
+    "GTrXL": "ppo_trxl.py --no-trxl-query-position --no-trxl-memory-gradient --trxl-gate gru",
+    "TrXL+": "ppo_trxl.py",
 }
-# The thesis' exploration bonus, with the weights that suit it on these tasks; the preset has the log barrier.
-ENTROPY = "--exploration-bonus entropy --init-ent-coef 1e-3 --final-ent-coef 1e-4"
-MUON = {  # --preset laptop, with what all agents have (learning.COMMON)
-    "no memory, Muon": f"ppo_gru.py --memory none {EARLY}",
-    "stack of 16, Muon": f"ppo_gru.py --memory none --frame-stack 16 {EARLY}",
-    "GRU, Muon": f"ppo_gru.py {EARLY}",
-    "TrXL, Muon": f"{BEFORE} {EARLY}",
-}
-# Muon with what the thesis has: smaller steps, a longer horizon, rewards as they are.
+# What it was until Muon.
+ADAMW = "--value-init-gain 1 --no-attend-commands --optimizer adamw --no-norm-reward --num-envs 32 --update-epochs 4"
+ADAMW += " --num-minibatches 8 --init-lr 1e-3 --final-lr 1e-4 --init-ent-coef 5e-4 --final-ent-coef 5e-5"
+ADAMW_TRXL = f"{ADAMW} --gamma 0.99 --vf-coef 0.5 --trxl-num-layers 2 --trxl-dim 64 --trxl-memory-length 128"
+# What suits ppo_gru.py in Mystery Path, as far as it learns there: smaller steps, a longer horizon, raw rewards.
 LOW_RATE = "--init-lr 3e-4 --gamma 0.995 --clip-coef 0.1 --no-norm-reward"
 LOW_RATE += " --exploration-bonus entropy --init-ent-coef 1e-4 --final-ent-coef 1e-5"
 AGENTS = {
-    "no memory": f"{GRU} --memory none",
-    "stack of 4": f"{GRU} --memory none --frame-stack 4",
-    "stack of 16": f"{GRU} --memory none --frame-stack 16",
-    "step encoding": f"{GRU} --memory none --step-encoding",
-    **MEMORIES,
-    "TrXL, preset": ADAMW_TRXL,
-    **MUON,
-    "TrXL, laptop": BEFORE,
-    # --preset laptop as it is.
-    "GRU, laptop": "ppo_gru.py",
-    "TrXL+": "ppo_trxl.py",
-    **{f"{name}, low rate": f"{flags} {LOW_RATE}" for name, flags in MUON.items()},
-    **{f"{name}, entropy": f"{flags} {ENTROPY}" for name, flags in MEMORIES.items()},
-    **{f"{name}, refreshed": f"{flags} --refresh-memory" for name, flags in MEMORIES.items()},
-    **{f"{name}, gradient": f"{MEMORIES[name]} --trxl-memory-gradient" for name in ("TrXL", "GTrXL")},
-    **{
-        f"{name}, gradient, refreshed": f"{MEMORIES[name]} --trxl-memory-gradient --refresh-memory"
-        for name in ("TrXL", "GTrXL")
-    },
+    **PRESET,
+    **{f"{name}, AdamW": f"{flags} {ADAMW_TRXL if 'trxl' in flags else ADAMW}" for name, flags in PRESET.items()},
+    # What the preset was for the transformer until 2026-11.
+    "TrXL+, before": "ppo_trxl.py --init-lr 1e-3 --gamma 0.99 --vf-coef 0.5 --value-init-gain 1",
+    "TrXL+, low rate": f"ppo_trxl.py --vf-coef 0.5 --value-init-gain 1 {LOW_RATE}",
 }
 
 
@@ -62,7 +41,8 @@ class Task:
     env_id: str
     total_timesteps: int
     options: dict = field(default_factory=dict)
-    trxl_flags: str = ""  # the transformer's own
+    gru_flags: str = ""  # of the agents of ppo_gru.py
+    trxl_flags: str = ""  # of those of ppo_trxl.py
 
     @property
     def title(self) -> str:
@@ -117,58 +97,31 @@ SMALL = {
         },
     ),
 }
-FULL = {  # trained for what two cores can do in a day, all agents and seeds together; few agents converge
-    env_id: Task(env_id, 1_000_000 * millions)
-    for env_id, millions in {
-        "MortarMayhem-v0": 3,
-        "MortarMayhem-Grid-v0": 6,
-        "MortarMayhemB-v0": 2,
-        "MortarMayhemB-Grid-v0": 1,
-        "Endless-MortarMayhem-v0": 6,
-        "MysteryPath-v0": 3,
-        "MysteryPath-Grid-v0": 3,
-        "Endless-MysteryPath-v0": 3,
-        "SearingSpotlights-v0": 3,
-        "Endless-SearingSpotlights-v0": 3,
-    }.items()
+FULL = {  # until an agent comes to rest, or as far as is affordable
+    env_id: Task(env_id, 1_000_000 * millions, gru_flags=flags)
+    for env_id, millions, flags in (
+        ("MortarMayhem-v0", 12, ""),
+        ("MortarMayhem-Grid-v0", 6, ""),
+        ("MortarMayhemB-v0", 6, ""),
+        ("MortarMayhemB-Grid-v0", 3, ""),
+        ("Endless-MortarMayhem-v0", 9, ""),
+        ("MysteryPath-v0", 6, LOW_RATE),
+        ("MysteryPath-Grid-v0", 15, LOW_RATE),
+        ("Endless-MysteryPath-v0", 3, ""),
+        ("SearingSpotlights-v0", 6, ""),
+        ("Endless-SearingSpotlights-v0", 9, ""),
+    )
 }
-# With --preset laptop: until an agent comes to rest, or as far as is affordable.
-LAPTOP = {
-    env_id: replace(FULL[env_id], total_timesteps=int(1_000_000 * millions))
-    for env_id, millions in {
-        "MortarMayhem-v0": 12,
-        "MortarMayhem-Grid-v0": 6,
-        "MortarMayhemB-v0": 6,
-        "MortarMayhemB-Grid-v0": 6,
-        "Endless-MortarMayhem-v0": 9,
-        "MysteryPath-v0": 6,
-        "MysteryPath-Grid-v0": 15,
-        "Endless-MysteryPath-v0": 3,
-        "SearingSpotlights-v0": 6,
-        "Endless-SearingSpotlights-v0": 9,
-    }.items()
-}
-# In the full tasks, transformers have about as many parameters as the GRU.
-WIDE = "--trxl-dim 96 --trxl-memory-length 256 --init-lr 5e-4"
 TASKS = SMALL | FULL
+IN_SMALL = ("no memory", "4 frames", "16 frames", "GRU", "TrXL", "TrXL+")
 SUITES = {  # tasks and agents
-    "small": (
-        SMALL,
-        ("no memory", "stack of 4", "stack of 16", "GRU", "TrXL", "TrXL, preset"),
-    ),
-    "full": (
-        FULL,
-        (
-            *("no memory", "stack of 4", "stack of 16", "step encoding", "GRU", "LSTM"),
-            *(f"{name} {WIDE}" for name in ("TrXL", "GTrXL", "TrXL, preset")),
-        ),
-    ),
-    "laptop": (LAPTOP, ("no memory, Muon", "stack of 16, Muon", "GRU, Muon", "TrXL, Muon")),
+    "small": (SMALL, tuple(f"{name}, AdamW" for name in IN_SMALL)),
+    "full": (FULL, ("no memory", "16 frames", "GRU", "TrXL+")),
 }
 COLORS = {  # an agent has the same in every picture
     "no memory": "tab:gray",
-    "stack of 4": "tab:olive",
-    "stack of 16": "tab:brown",
+    "4 frames": "tab:olive",
+    "16 frames": "tab:brown",
     "step encoding": "tab:pink",
     "GRU": "tab:blue",
     "LSTM": "tab:cyan",
@@ -176,14 +129,9 @@ COLORS = {  # an agent has the same in every picture
     "GTrXL": "tab:purple",
     "TrXL+": "tab:red",
 }
-COLORS |= {
-    f"{name}, Muon{rate}": COLORS[name]
-    for name in ("no memory", "stack of 16", "GRU", "TrXL+")
-    for rate in ("", ", low rate")
-}
+COLORS |= {f"{name}, AdamW": color for name, color in COLORS.items()}
 
 
 def short(agent: str) -> str:
-    """Return an agent's name for tables: its flags in words, without those that make a transformer wide."""
-    name = agent.replace(f" {WIDE}", "").replace("TrXL, preset", "TrXL+").replace("TrXL, Muon", "TrXL+, Muon")
-    return re.sub(r" --(?:trxl-)?([\w-]+)", lambda found: f", {found[1].replace('-', ' ')}", name)
+    """Return an agent's name for tables: its flags in words."""
+    return re.sub(r" --(?:trxl-)?([\w-]+)", lambda found: f", {found[1].replace('-', ' ')}", agent)

@@ -25,11 +25,10 @@ import ppo_gru
 import tables
 from ppo_utils.evaluation import beginnings
 from ppo_utils.flags import RunArgs
-from suites import TASKS
+from suites import COLORS, TASKS
 
 RESULTS = Path(__file__).with_name("results")
-AGENTS = tuple(f"{name}, Muon, low rate" for name in ("no memory", "stack of 16", "GRU", "TrXL"))
-RUNS = {"MysteryPath-Grid-v0": ("laptop", 15e6), "MysteryPath-v0": ("full", 6e6)}  # suite and steps
+IN = ("MysteryPath-Grid-v0", "MysteryPath-v0")  # tasks that have the same paths
 LEVELS = 100_000  # that are trained on by default
 TEST_LEVELS = 1000
 COUNTED = {  # what the table calls them: id, reset options
@@ -76,22 +75,19 @@ def print_scores(out: Path) -> None:
     """Print a table for each task, and draw them."""
     figure = Figure(figsize=(9, 2.8), layout="constrained")
     columns = ["0", "1", "2-4", "5-10", "11-30", "31-100", "more"]
-    configs = [
-        learning.Config(suite=suite, tasks=(env_id,), steps=int(steps), agents=AGENTS, results=RESULTS)
-        for env_id, (suite, steps) in RUNS.items()
-    ]
-    plans = [learning.plans_of(config) for config in configs]
-    times = times_trained_on(next(iter(plans[0].values())).args, configs[0].test_levels)  # both tasks: the same paths
+    config = learning.Config(suite="full", tasks=IN, results=RESULTS)
+    plans = learning.plans_of(config)
+    times = times_trained_on(next(iter(plans.values())).args, config.test_levels)
     inside = [(low <= times) & (times < high) for low, high in pairwise(EDGES)]
-    for axis, config, planned in zip(figure.subplots(1, 2, sharey=True), configs, plans, strict=True):
-        (env_id,) = config.tasks
+    results = learning.results_of(config, plans)
+    for axis, (env_id, agents) in zip(figure.subplots(1, 2, sharey=True), results.items(), strict=True):
         print(f"| {env_id}, path trained on | {' | '.join(columns)} | all |\n|---|{'---:|' * (len(columns) + 1)}")
         print(f"| test levels | {' | '.join(str(each.sum()) for each in inside)} | {len(times):,} |")
-        for agent, runs in learning.results_of(config, planned)[env_id].items():
+        for agent, runs in ((agent, runs) for agent, runs in agents.items() if runs):
             scores = tables.final_scores("success", runs, every_level=True)  # (R, M, E)
             means = [scores[:, each].mean() for each in inside]
             print(f"| {agent} | {' | '.join(f'{mean:.2f}' for mean in [*means, scores.mean()])} |")
-            axis.plot(columns, means, marker="o", label=agent.removesuffix(", Muon, low rate"))
+            axis.plot(columns, means, marker="o", color=COLORS[agent], label=agent)
         axis.set_title(env_id)
         axis.set_xlabel("how often the level's path was trained on")
         print()

@@ -37,4 +37,4 @@ def test_an_agent_plays_as_well_as_published(name, metric, score, flags):
     assert scores.mean() == pytest.approx(published, abs=0.005 + 4 * error)
 
     (planned,) = learning.plans_of(tyro.cli(learning.Config, args=shlex.split(flags))).values()
-    assert asdict(planned.args) == asdict(checkpoint.args)
+    assert learning.settings(asdict(planned.args)) == learning.settings(asdict(checkpoint.args))

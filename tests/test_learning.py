@@ -36,33 +36,33 @@ ROOT = Path(__file__).parents[1]
 
 # Flags of tasks and of agents do not depend on each other: each agent in a task, and two scripts in each task.
 EACH = [(agent, "mystery-path") for agent in learning.AGENTS]
-EACH += [(agent, task) for agent in ("GRU", "TrXL") for task in learning.TASKS if task != "mystery-path"]
+EACH += [(agent, task) for agent in ("GRU", "TrXL+") for task in learning.TASKS if task != "mystery-path"]
 
 
 @pytest.mark.parametrize(("agent", "task"), EACH)
 def test_every_agent_s_command_can_be_parsed(task, agent):
     args = learning.plan(learning.Config(steps=6_000_000), learning.TASKS[task], agent, 2).args
     assert args.total_timesteps == args.anneal_steps == 6_000_000
-    assert args.refresh_memory == ("refreshed" in agent)
     # The thesis' queries do not know their step.
-    of_a_preset = agent.startswith(("TrXL, preset", "TrXL, Muon", "TrXL, laptop", "TrXL+"))
-    assert getattr(args, "trxl_query_position", False) == of_a_preset
-    assert getattr(args, "trxl_memory_gradient", False) == ("gradient" in agent or of_a_preset)
+    assert getattr(args, "trxl_query_position", False) == getattr(args, "trxl_memory_gradient", False) == ("+" in agent)
     gate = {"TrXL": "none", "TrXL+": "none", "GTrXL": "gru"}.get(agent.split(",")[0])
     assert getattr(args, "trxl_gate", None) == gate
-    assert (args.init_lr == 3e-4) == (args.gamma == 0.995) == ("low rate" in agent or agent == "TrXL+")
-    assert (args.clip_coef == 0.1) == ("low rate" in agent)
+    low_rate = "low rate" in agent or (agent == "GRU" and task in ("MysteryPath-v0", "MysteryPath-Grid-v0"))
+    of_preset = agent in ("TrXL", "TrXL+", "GTrXL")
+    assert (args.init_lr == 3e-4) == (args.gamma == 0.995) == (low_rate or of_preset)
+    assert (args.clip_coef == 0.1) == low_rate
+    assert (args.optimizer == "adamw") == agent.endswith(", AdamW")
 
 
 def test_an_agent_may_have_further_flags(tmp_path):
     task = learning.TASKS["mystery-path"]
-    agent = "TrXL, gradient --trxl-num-layers 3 --trxl-positional-encoding learned"
+    agent = "TrXL+, AdamW --trxl-num-layers 3 --trxl-positional-encoding learned"
     args = learning.plan(learning.Config(), task, agent, 1).args
     assert args.trxl_memory_gradient
     assert (args.trxl_num_layers, args.trxl_positional_encoding) == (3, "learned")  # the task's own flags come first
-    assert args.exp_name == "TrXL-gradient-trxl-num-layers-3-trxl-positional-encoding-learned"
-    with pytest.raises(SystemExit, match=r"there is no 'TrXXL'; there are no memory; stack of 4; .*GRU"):
-        learning.main(learning.Config(agents=("GRU", "TrXXL --trxl-num-layers 3"), folder=tmp_path))
+    assert args.exp_name == "TrXLplus-AdamW-trxl-num-layers-3-trxl-positional-encoding-learned"
+    with pytest.raises(SystemExit, match=r"there is no 'TrXXL'; there are no memory; 4 frames; .*GRU"):
+        learning.main(learning.Config(agents=("GRU", "TrXXL --trxl-num-layers 3"), folder=tmp_path, report=True))
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_numbers_that_no_training_can_have(wrong, message):
         "--exp-name mine",
         "--env-id MysteryPath-v0",
         "--env-options {}",
-        "--total-timesteps 5000",
+        "--total-timesteps 50000",
         "--eval-interval 3",
     ],
 )
@@ -107,7 +107,7 @@ def test_an_agent_has_no_task_of_its_own(flags):
         ("GRU --num-levels 1000000", 1, "levels below 1,000,000 are for .*; it has 1,000,000 from 0 on, and 50 "),
         ("GRU --num-envs 0", 1, "GRU --num-envs 0: --num-envs is 0; it must be 1 or more"),
         ("GRU", -1, "GRU: --seed is -1; it must be 0 or more"),
-        ("GRU --num-minibatches 99999", 1, "GRU --num-minibatches 99999: .* an iteration may have only 32 sequences"),
+        ("GRU --num-minibatches 99999", 1, "GRU --num-minibatches 99999: .* an iteration may have only 128 sequences"),
     ],
 )
 def test_what_a_script_refuses_is_told_before_anything_is_trained(agent, seed, message):
@@ -124,10 +124,9 @@ def test_leftovers_among_the_results_are_no_runs(tmp_path):
 
 def test_agents_to_draw_and_names_are_checked():
     with pytest.raises(SystemExit, match="there is no 'LSTM'; there are GRU; TrXL"):
-        learning.main(learning.Config(agents=("GRU", "TrXL"), draw=("LSTM",)))
-    wide = "TrXL --trxl-dim 96 --trxl-memory-length 256 --init-lr 5e-4"
+        learning.main(learning.Config(agents=("GRU", "TrXL"), draw=("LSTM",), report=True))
     with pytest.raises(SystemExit, match="two of these agents have the same name in tables: TrXL, TrXL"):
-        learning.main(learning.Config(agents=("TrXL", wide)))
+        learning.main(learning.Config(agents=("TrXL", "TrXL"), report=True))
 
 
 def test_an_agent_goes_on_with_no_other_run(tmp_path):
@@ -137,7 +136,7 @@ def test_an_agent_goes_on_with_no_other_run(tmp_path):
 
 def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, capsys):
     small = "--num-envs 4 --num-steps 32 --num-minibatches 2 --hidden-size 8 --eval-levels 2"
-    agent, task = f"GRU, refreshed {small}", learning.TASKS["mortar-mayhem"]
+    agent, task = f"GRU --refresh-memory {small}", learning.TASKS["mortar-mayhem"]
     config = learning.Config(
         tasks=("mortar-mayhem",),
         agents=(agent,),
@@ -374,30 +373,12 @@ def test_a_stopped_program_stops_its_trainings_with_a_checkpoint(tmp_path, curve
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # nothing trains any more
 
 
-def test_an_agent_named_as_in_the_suite_is_the_suite_s():
-    config = learning.Config(suite="full", tasks=("MysteryPath-v0",), agents=("TrXL", "TrXL, refreshed"), seeds=(1,))
-    wide, narrow = learning.plans_of(config).values()
-    assert (wide.args.trxl_dim, narrow.args.trxl_dim) == (96, 64)
-    (preset,) = learning.plans_of(replace(config, agents=("TrXL, preset",))).values()
-    assert (preset.args.trxl_dim, preset.args.trxl_memory_gradient) == (96, True)
-
-
 def test_the_full_suite():
-    """The ten environments with their default options, and the agents of figures 6.1 to 6.3."""
+    """The ten environments with their default options."""
     tasks, agents = learning.SUITES["full"]
     assert len(tasks) == 10
     assert [(name, task.env_id, task.options) for name, task in tasks.items()] == [(i, i, {}) for i in tasks]
-    assert len(agents) == len(set(agents)) == 9
-
-
-def test_the_laptop_suite_has_budgets_of_its_own():
-    task = "Endless-MortarMayhem-v0"
-    of_suites = {}
-    for suite in ("laptop", "full"):
-        config = learning.Config(suite=suite, tasks=(task,), agents=("GRU, Muon",), seeds=(1,))
-        (plan,) = learning.plans_of(config).values()
-        of_suites[suite] = plan.args.total_timesteps
-    assert of_suites == {"laptop": 9_000_000, "full": 6_000_000}
+    assert [*agents] == ["no memory", "16 frames", "GRU", "TrXL+"]
 
 
 def test_a_run_goes_on_only_from_a_checkpoint(tmp_path, monkeypatch):
@@ -419,6 +400,6 @@ def test_a_run_goes_on_only_from_a_checkpoint(tmp_path, monkeypatch):
 def test_only_the_agents_to_draw_are_drawn(tmp_path, monkeypatch):
     drawn, task = {}, "MortarMayhem-Grid-v0"
     monkeypatch.setattr(tables, "draw", lambda tasks, out: drawn.update(tasks))
-    config = learning.Config(suite="laptop", tasks=(task,), draw=("GRU, Muon",), report=True)
+    config = learning.Config(suite="full", tasks=(task,), draw=("GRU",), report=True)
     learning.main(replace(config, results=ROOT / "benchmarks/results"))
-    assert [*drawn[task]] == ["GRU, Muon"]
+    assert [*drawn[task]] == ["GRU"]
