@@ -122,9 +122,14 @@ def task_of(args: dict[str, Any]) -> str:
     return " ".join([args["env_id"], *given])
 
 
+def bare_id(env_id: str) -> str:
+    """Return an environment's id without module and namespace."""
+    return re.split("[:/]", env_id)[-1]
+
+
 def own_metric(env_id: str) -> str:
     """Return the name of the environment's own metric."""
-    name = re.split("[:/]", env_id)[-1]  # without module and namespace
+    name = bare_id(env_id)
     return next((metric for start, metric in OWN_METRIC.items() if name.startswith(start)), "return")
 
 

@@ -26,6 +26,7 @@ from memory_gym_envs.searing_spotlights import VARIANTS, SearingSpotlights
 from memory_gym_envs.searing_spotlights.drawing import light_masks, spot_stencils
 from memory_gym_envs.searing_spotlights.rules import spot_positions
 from memory_gym_envs.searing_spotlights.state import SPEED, TIME
+from ppo_utils.scores import bare_id
 
 OBSERVATION = "observation"  # the name of an observation that is no Dict, where it becomes a part of one
 COMMANDS, STEP_ENCODING, LAST_ACTION = "commands", "step_encoding", "last_action"  # parts that the wrappers add
@@ -482,7 +483,7 @@ def _batched(observations: np.ndarray) -> Any:
 
 def is_act_task(env: VectorEnv) -> bool:
     """Return whether the environment is Mortar Mayhem without a clue: all commands are observed all the time."""
-    variant = MORTAR_MAYHEM.get(env.spec.id if env.spec else None)
+    variant = MORTAR_MAYHEM.get(bare_id(env.spec.id) if env.spec else None)
     return variant is not None and not variant.clue
 
 

@@ -319,6 +319,11 @@ def test_commands_are_a_part_of_their_own(env_id, obs_type):
     assert ended > LANES
 
 
+def test_an_id_with_a_namespace_has_a_list():
+    envs = make_envs("memory_gym_envs/MortarMayhemB-Grid-v0", 2, obs_type="vector", attend_commands=True)
+    assert envs.single_observation_space["commands"].shape == (20, 9)
+
+
 def test_other_environments_have_no_list():
     spaces = [
         make_envs(env_id, 2, obs_type="vector", attend_commands=flag).single_observation_space
