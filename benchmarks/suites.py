@@ -130,6 +130,7 @@ COLORS = {  # an agent has the same in every picture
     "TrXL+": "tab:red",
 }
 COLORS |= {f"{name}, AdamW": color for name, color in COLORS.items()}
+COLORS |= {f"TrXL+, {settings}": "tab:green" for settings in ("before", "low rate")}
 
 
 def short(agent: str) -> str:

@@ -28,6 +28,7 @@ from ppo_utils.flags import RunArgs
 from suites import COLORS, TASKS
 
 RESULTS = Path(__file__).with_name("results")
+AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, low rate", "TrXL+")
 IN = ("MysteryPath-Grid-v0", "MysteryPath-v0")  # tasks that have the same paths
 LEVELS = 100_000  # that are trained on by default
 TEST_LEVELS = 1000
@@ -75,7 +76,7 @@ def print_scores(out: Path) -> None:
     """Print a table for each task, and draw them."""
     figure = Figure(figsize=(9, 2.8), layout="constrained")
     columns = ["0", "1", "2-4", "5-10", "11-30", "31-100", "more"]
-    config = learning.Config(suite="full", tasks=IN, results=RESULTS)
+    config = learning.Config(tasks=IN, agents=AGENTS, results=RESULTS)
     plans = learning.plans_of(config)
     times = times_trained_on(next(iter(plans.values())).args, config.test_levels)
     inside = [(low <= times) & (times < high) for low, high in pairwise(EDGES)]
@@ -91,7 +92,7 @@ def print_scores(out: Path) -> None:
         axis.set_title(env_id)
         axis.set_xlabel("how often the level's path was trained on")
         print()
-    axis.legend(frameon=False)
+    axis.legend(*figure.axes[0].get_legend_handles_labels(), frameon=False)
     figure.axes[0].set_ylabel("success")
     figure.savefig(out, dpi=120)
 
