@@ -255,7 +255,7 @@ def entry(tmp_path, monkeypatch):
 
 def test_an_entry_has_its_score_and_minutes(entry, capsys):
     entry(0.95, 0.94, 0.96, 0.95, 0.95)
-    row = "| SearingSpotlights-v0 | 0.9 | `GRU` | 0.95 ± 0.00 | 0.0000 | 6 M | 3.0 | 2026-11-29, abc1234 |"
+    row = "| SearingSpotlights-v0 | 0.9 | `GRU` | 0.95 ± 0.00 | 0.0001 | 6 M | 3.0 | 2026-11-29, abc1234 |"
     assert capsys.readouterr().out.splitlines()[-1] == row
 
 
