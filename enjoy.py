@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from ppo_utils.checkpoints import import_script, load_weights, read_model, saved_args
 from ppo_utils.environments import as_tensors, envs_for, is_memory_gym, with_options, wrappers_of
 from ppo_utils.errors import RunError
-from ppo_utils.evaluation import first_unseen, make_agent
+from ppo_utils.evaluation import first_after, make_agent
 from ppo_utils.flags import bounded, check_bounds
 from ppo_utils.infos import final_numbers, ground_truths
 from ppo_utils.terminal import one_line_exit, open_streams
@@ -402,7 +402,7 @@ def main(config: Config) -> str:
     for path, task in tasks.items():
         if task != (env_id, options):
             raise ValueError(f"{path} plays another task than {config.checkpoint}; agents on one page play the same")
-    seed = max(first_unseen(args) for _, _, args in players.values()) if config.seed is None else config.seed
+    seed = max(first_after(args) for _, _, args in players.values()) if config.seed is None else config.seed
     episodes = []
     for level in range(seed, seed + config.levels):
         for path, (agent, envs, args) in players.items():

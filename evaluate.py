@@ -1,4 +1,4 @@
-"""Score trained agents on levels that they have never seen, or draw their sample-efficiency curves.
+"""Score trained agents on other levels than those of their training, or draw their sample-efficiency curves.
 
     python evaluate.py runs/*/model.pt --json scores.json
     python evaluate.py runs/X/checkpoint-*.pt
@@ -36,7 +36,7 @@ from tqdm import tqdm
 from ppo_utils.checkpoints import import_script, load_weights, read_model, saved_args
 from ppo_utils.environments import envs_for, with_options
 from ppo_utils.errors import RunError
-from ppo_utils.evaluation import are_trained_on, evaluate, evaluation_levels, first_unseen, make_agent
+from ppo_utils.evaluation import are_trained_on, evaluate, evaluation_levels, first_after, make_agent
 from ppo_utils.flags import NonNegativeInt, PositiveInt, check_bounds
 from ppo_utils.runs import report_out_of_memory
 from ppo_utils.scores import own_metric, summary, table, task_of, tasks_of
@@ -48,7 +48,7 @@ AT_ONCE = 1000  # episodes; more would take much memory
 
 @dataclass
 class Config:
-    """Score checkpoints on unseen levels, or draw the curves of training runs."""
+    """Score checkpoints on other levels than the training's, or draw the curves of training runs."""
 
     checkpoints: tyro.conf.Positional[tuple[str, ...]] = ()
     """model files: model.pt that --save-model wrote, or those that were written during training"""
@@ -143,7 +143,7 @@ def play(checkpoint: Checkpoint, config: Config) -> dict[str, np.ndarray]:
 def title_of(args: dict[str, Any], config: Config) -> str:
     """Name the task and the levels of it that are played."""
     training = SimpleNamespace(**args)
-    first = first_unseen(training) if config.start_level is None else config.start_level
+    first = first_after(training) if config.start_level is None else config.start_level
     trained_on = " (of its training)" if are_trained_on(training, first, config.levels) else ""
     if config.new_levels:
         which = f"{config.levels} levels from {first} on that begin as none of the training's does"

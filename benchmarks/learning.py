@@ -47,7 +47,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of 
 
 import tables
 from ppo_utils.checkpoints import read_model
-from ppo_utils.evaluation import first_unseen
+from ppo_utils.evaluation import first_after
 from ppo_utils.flags import PositiveInt, check_args, check_bounds, check_minibatches
 from ppo_utils.run_logs import SECONDS, NoCurvesError, RunLog, Runs, align, read_run
 from ppo_utils.runs import parse_args
@@ -185,7 +185,7 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
         )
     if not args.save_model:
         raise SystemExit(f"{agent}: --no-save-model leaves no weights to score")
-    if first_unseen(args) + args.eval_levels > FIRST_TEST_LEVEL:
+    if first_after(args) + args.eval_levels > FIRST_TEST_LEVEL:
         raise SystemExit(
             f"{agent}: levels below {FIRST_TEST_LEVEL:,} are for training and its evaluations, those from there on for "
             f"the test; it has {args.num_levels:,} from {args.start_level:,} on, and {args.eval_levels} to evaluate"

@@ -2,7 +2,7 @@
 
     python benchmarks/window_probe.py runs/RUN/model.pt --windows 32 64 128 256
 
-The window is no weight: the same agent plays the same unseen levels with each (as evaluate.py does). A lower score with
+The window is no weight: the same agent plays the same levels with each (as evaluate.py does). A lower score with
 a narrower window suggests that it used what this one does not show. That a wider one brings nothing says little, since
 the agent has not learned with it.
 """
@@ -34,7 +34,7 @@ class Config:
     windows: tuple[int, ...] = (16, 32, 64, 128, 256)
     """steps that the agent may look back at"""
     levels: int = 50
-    """unseen levels to play"""
+    """levels to play, which follow the training's"""
     repeats: int = 3
     """how often to play each"""
     max_steps: int = 10_000

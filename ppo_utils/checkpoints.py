@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from ppo_utils.environments import load_state, save_state
-from ppo_utils.evaluation import are_trained_on, first_unseen
+from ppo_utils.evaluation import are_trained_on, first_after
 from ppo_utils.flags import RunArgs, as_flags, flag
 from ppo_utils.processes import all_gather, rank_and_size
 from ppo_utils.run import Run
@@ -249,12 +249,12 @@ def load_model(args: RunArgs, agent: nn.Module, script: str) -> None:
         ours, theirs = (as_flags({name: getattr(each, name) for name in differ}) for each in (args, theirs))
         raise ValueError(f"{path} was trained with {theirs}, not with {ours}")
     load_weights(agent, saved, path)
-    first, beyond = first_unseen(args), first_unseen(theirs)
+    first, beyond = first_after(args), first_after(theirs)
     met = are_trained_on(theirs, first, args.eval_levels)
     if met and theirs.env_id == args.env_id and rank_and_size()[0] == 0:
         tell(
             f"{path} was trained on levels {theirs.start_level} to {beyond - 1}, and evaluations of this run play "
-            f"levels {first} to {first + args.eval_levels - 1}; --start-level {beyond} makes them unseen ones"
+            f"levels {first} to {first + args.eval_levels - 1}; --start-level {beyond} makes them others"
         )
 
 

@@ -22,24 +22,25 @@ AT_ONCE = 1000  # levels whose beginnings are looked at
 MEMORY_STEPS = 64  # that a memory has room for, until `with_room` makes room again
 
 
-def first_unseen(args: RunArgs) -> int:
+def first_after(args: RunArgs) -> int:
     """Return the first level after those that a script's arguments train on."""
     return args.start_level + args.num_levels
 
 
 def are_trained_on(args: RunArgs, first: int, levels: int) -> bool:
     """Return whether a script's arguments train on any of so many levels from `first` on; without a limit, on none."""
-    return max(first, args.start_level) < min(first + levels, first_unseen(args))
+    return max(first, args.start_level) < min(first + levels, first_after(args))
 
 
 def evaluation_levels(
     args: RunArgs, levels: int, repeats: int = REPEATS, first: int | None = None, new: bool = False
 ) -> list[int]:
-    """Return the seeds (N,) of an evaluation's levels, with repeats: from `first`, or from the first unseen one.
+    """Return the seeds (N,) of an evaluation's levels, with repeats: from `first`, or those that follow the
+    training's.
 
     new: only `new_levels`, which may raise ValueError.
     """
-    first = first_unseen(args) if first is None else first
+    first = first_after(args) if first is None else first
     numbers = new_levels(args, levels, first) if new else range(first, first + levels)
     return [level for level in numbers for _ in range(repeats)]
 

@@ -125,7 +125,7 @@ class RunArgs:
     Path, else 0)"""
 
     eval_interval: NonNegativeInt = 0
-    """iterations between evaluations on unseen levels, with another one at the end (0: no evaluations)"""
+    """iterations between evaluations on other levels, with another one at the end (0: no evaluations)"""
     eval_levels: PositiveInt = 50
     """number of levels of an evaluation, which follow those of the training; each is played three times"""
     eval_max_steps: PositiveInt = 10_000

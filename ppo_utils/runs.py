@@ -326,7 +326,7 @@ def summary(args: RunArgs, run: Run) -> str:
     """Return the lines that a training ends with: what it reached, and the commands to go on with."""
     score = "no episode ended"
     if run.scores:
-        score = f"return {run.scores['return'].mean():.2f} on {args.eval_levels} unseen levels"
+        score = f"return {run.scores['return'].mean():.2f} on {args.eval_levels} other levels"
     elif run.returns:
         score = f"return {np.mean(run.returns):.2f}, mean of the last {len(run.returns)} episodes"
     folder = shlex.quote(shown(run.folder, run.started_in))

@@ -1,4 +1,4 @@
-"""Evaluation: unseen levels, fresh memory, one episode a lane, and nothing of it in the training."""
+"""Evaluation: other levels, fresh memory, one episode a lane, and nothing of it in the training."""
 
 import dataclasses
 

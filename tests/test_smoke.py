@@ -470,7 +470,7 @@ def test_the_last_lines(tiny, capsys, monkeypatch):
     folder = ppo_gru.main(dataclasses.replace(args, eval_interval=1, eval_levels=2, save_model=True, exp_name="b"))
     folder = folder.relative_to(os.getcwd())
     score, *commands = capsys.readouterr().out.splitlines()
-    assert re.fullmatch(rf"{folder}: 256 steps, return -?\d\.\d\d on 2 unseen levels", score)
+    assert re.fullmatch(rf"{folder}: 256 steps, return -?\d\.\d\d on 2 other levels", score)
     assert commands[0] == f"evaluate: python evaluate.py {folder / 'model.pt'}"
     assert commands[1].startswith('watch: pip install -e ".[eval]" && python enjoy.py')
     args = tiny(env_id="MysteryPath-v0", obs_type="vector", checkpoint_interval=0, exp_name="c d")
