@@ -61,7 +61,13 @@ def row(entry: Entry) -> str:
     p_value = probability(scores.mean((1, 2)), entry.target)
     if p_value >= LEVEL:
         raise SystemExit(f"{entry.agent} in {entry.task} is not above {entry.target:g}: p = {p_value:.3f}")
-    cells = [entry.task, f"{entry.target:g}", f"`{entry.agent}`", tables.mean_and_error(scores), f"{max(p_value, LEAST):.4f}"]
+    cells = [
+        entry.task,
+        f"{entry.target:g}",
+        f"`{entry.agent}`",
+        tables.mean_and_error(scores),
+        f"{max(p_value, LEAST):.4f}",
+    ]
     cells += [f"{entry.steps / 1e6:g} M", f"{tables.minutes_of(runs):.1f}", f"{entry.date}, {entry.commit}"]
     return f"| {' | '.join(cells)} |"
 

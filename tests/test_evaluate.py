@@ -380,7 +380,7 @@ def test_the_arguments_of_an_older_run():
     run = read_run("old")
     defaults = {name: str(value) for name, value in asdict(ppo_gru.Args()).items()}
     changed = {"script": "ppo_gru", "seed": "3", "num_envs": "4", "env_id": "A-v0", "trunk_size": "7"}
-    changed["value_init_gain"] = "1.0"  # which was no flag, and had this value
+    changed |= {"value_init_gain": "1.0", "vector_frequencies": "0"}  # which were no flags, and had these values
     assert run.args == defaults | changed
     assert [each.tolist() for each in run.curves["eval/return"]] == [[10], [[[2]]]]
 

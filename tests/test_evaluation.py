@@ -201,8 +201,8 @@ def test_what_is_logged_of_an_evaluation(tiny, curves, monkeypatch):
         ({"env_id": "MortarMayhem-Grid-v0", "frame_stack": 4}, {"observation": (84, 84, 4)}),
         ({"env_id": "MortarMayhem-Grid-v0", "obs_type": "vector"}, {"observation": (24,)}),
         (
-            {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "frame_stack": 16, "step_encoding": True},
-            {"observation": (16 * 16,), "step_encoding": (16,)},
+            {"env_id": "MortarMayhem-Grid-v0", "obs_type": "vector", "frame_stack": 16, "step_encoding": True},
+            {"observation": (16 * 24,), "step_encoding": (16,)},
         ),
         (
             {"env_id": "MortarMayhemB-Grid-v0", "step_encoding": True},
