@@ -54,7 +54,7 @@ def draw(every: dict[str, tuple[np.ndarray, np.ndarray]], path: Path) -> None:
         shares = np.where(episodes[:, :-1] >= FEWEST, episodes[:, 1:] / np.maximum(episodes[:, :-1], 1), np.nan)
         ends = (0, steps[-1] / 1e6, 0.5, COUNT + 0.5)
         image = axis.imshow(shares.T, origin="lower", extent=ends, aspect="auto", vmin=0, vmax=1, cmap="viridis")
-        axis.set_title(name, fontsize=9)
+        axis.set_title(name.replace(", ", "\n", 1), fontsize=9)
         axis.set_xlabel("million steps")
         axis.set_yticks([1, 5, 10])
     axes[0].set_ylabel("command")

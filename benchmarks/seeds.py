@@ -19,7 +19,7 @@ import tables
 from suites import COLORS, TASKS
 
 RESULTS = Path(__file__).with_name("results")
-AGENTS = ("no memory", "16 frames", "GRU", "TrXL+")
+AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, before", "TrXL+")
 
 
 def main(out: Path = Path("docs/seeds.png")) -> None:
@@ -40,7 +40,7 @@ def main(out: Path = Path("docs/seeds.png")) -> None:
         axis.axhline(bounds[env_id].scripted, color="gray", linestyle="--", label="scripted player")
         if task.best_score is None:
             axis.set_yscale("log")
-        axis.set_xticks(range(len(AGENTS)), AGENTS, fontsize=8)
+        axis.set_xticks(range(len(AGENTS)), [agent.replace(" ", "\n") for agent in AGENTS], fontsize=7)
         axis.set_xlim(-0.5, len(AGENTS) - 0.5)
         axis.set_title(f"{env_id.removesuffix('-v0')}, {task.total_timesteps / 1e6:g} M", fontsize=9)
         axis.set_ylabel(task.score, fontsize=8)

@@ -67,9 +67,9 @@ def test_every_seed_is_a_dot(monkeypatch, tmp_path):
     monkeypatch.setattr(Axes, "plot", lambda self, x, y, style, **_: dots.append((x, y)) if style == "o" else None)
     seeds.main(tmp_path / "seeds.png")
     drawn = [list(zip(x, y, strict=True)) for x, y in dots]
-    assert len(drawn) == 40
+    assert len(drawn) == 50
     assert {len(each) for each in drawn} == {0, 3}, "some agents are not trained in all tasks"
-    assert max(y for _, y in drawn[7]) == pytest.approx(1, abs=0.02), "TrXL+ in Mortar Mayhem Grid"
+    assert max(y for _, y in drawn[9]) == pytest.approx(1, abs=0.02), "TrXL+ in Mortar Mayhem Grid"
     made, shown = (Image.open(folder / "seeds.png").size for folder in (tmp_path, ROOT / "docs"))
     assert made == shown
 
