@@ -34,9 +34,8 @@ GREEN, ORANGE, GRAY = (0, 140, 0), (240, 120, 0), (200, 200, 200)
 
 def strip(step: int, truth: dict[str, Any], width: int) -> Image.Image:
     """Return a strip of that width with the episode's step and, in Mortar Mayhem, its commands and how far they are."""
-    picture = text(f"step {step}", width)
     if "commands" not in truth:
-        return picture
+        return text(f"step {step}", width)
     picture = Image.new("RGB", (width, LABEL), "white")
     words, side, between = 120, LABEL - 4, 55  # pixels: for the step, of a command's box, from one box to the next
     picture.paste(text(f"step {step}", words))
