@@ -254,7 +254,7 @@ def load_model(args: RunArgs, agent: nn.Module, script: str) -> None:
     if met and theirs.env_id == args.env_id and rank_and_size()[0] == 0:
         tell(
             f"{path} was trained on levels {theirs.start_level} to {beyond - 1}, and evaluations of this run play "
-            f"levels {first} to {first + args.eval_levels - 1}; --start-level {beyond} makes them others"
+            f"levels {first} to {first + args.eval_levels - 1}; with --start-level {beyond}, they play others"
         )
 
 
