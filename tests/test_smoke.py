@@ -412,7 +412,8 @@ def test_levels_of_an_evaluation_that_loaded_weights_were_trained_on(
     path = trained_on_90_levels
     opened(ppo_gru, tiny(**{"eval_levels": 10, "load_model": path, **flags}))
     told = (
-        f"{path} was trained on levels 12 to 101, and evaluations of this run play levels {levels}; --start-level 102 "
+        f"{path} was trained on levels 12 to 101, and evaluations of this run play levels {levels}; "
+        "with --start-level 102, "
     )
     assert (told in capsys.readouterr().err) == (levels is not None)
 
