@@ -148,8 +148,7 @@ class MortarMayhem(WalkingVectorEnv):
     def begin(self, lanes: np.ndarray) -> None:
         """Samples the lanes' next levels and starts their episodes."""
         for lane in lanes.tolist():
-            level = levels.sample_level(self._rngs[lane], self.settings[lane], self.variant)
-            levels.write_level(self.state, lane, level, self.variant)
+            levels.start_episode(self.state, lane, self._rngs[lane], self.settings[lane], self.variant)
         self._clues_open = self.variant.clue
 
     def apply_rules(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,12 +1,15 @@
-"""Levels: what the generator decides at a reset, and how an episode starts with it."""
+"""Levels: what the generator decides at a reset.
+
+All is sampled in the original's order, so that a seed means the same level here.
+"""
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from memory_gym_envs.mortar_mayhem.arena import COMMANDS, MOVES, TILE, TORUS_SIZE, tile_tables
+from memory_gym_envs.mortar_mayhem.arena import COMMANDS, MOVES, TILE, tile_tables
 from memory_gym_envs.mortar_mayhem.options import VECTOR_ORDER, MortarVariant
 from memory_gym_envs.mortar_mayhem.rules import set_target, write_clue
 from memory_gym_envs.mortar_mayhem.state import State
@@ -15,35 +18,42 @@ from memory_gym_envs.words import pick, sample_below, word_source
 VECTOR_INDEX = [VECTOR_ORDER.index(command) for command in COMMANDS]
 
 
-class Level(NamedTuple):
-    """What the generator decides at a reset."""
-
-    tile: int  # where the agent starts: column * arena size + row
-    offset: tuple[int, int]  # how far from the tile's centre, x and y in pixels
-    commands: list[int]
-    show_duration: int
-    show_delay: int
-    explosion_duration: int
-    explosion_delay: int
-
-
-def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: MortarVariant) -> Level:
-    """Samples a level in the original's order, so that its seeds mean the same here."""
-    next_word = word_source(rng)
-    size = TORUS_SIZE if variant.endless else values["arena_size"]
-    tile = sample_below(next_word, size * size)
-    offset = (sample_below(next_word, 4) - 2, sample_below(next_word, 4) - 2) if variant.jitter else (0, 0)
+def start_episode(
+    s: State, lane: int, rng: np.random.Generator, values: dict[str, Any], variant: MortarVariant
+) -> None:
+    """Starts the lane's next episode, with these reset options."""
+    next_word, tiles, size = word_source(rng), tile_tables(), int(s.size[lane])
+    tile = sample_below(next_word, size * size)  # column * arena size + row
+    start = int(s.calm_floor[lane]) + 1 + tile  # FLOORS has an arena's calm floor before its tiles
+    s.pos[lane] = tiles.corner[start] + TILE // 2
+    if variant.endless or not (variant.clue or variant.grid):  # up to two pixels off the tile's centre
+        s.pos[lane] += sample_below(next_word, 4) - 2, sample_below(next_word, 4) - 2
     if variant.endless:
         kinds = values["allowed_commands"]
         commands = [sample_below(next_word, kinds) for _ in range(values["initial_command_count"])]
     else:
         count = pick(next_word, values["command_count"])
         commands = sample_walk(next_word, tile, count, size, values["allowed_commands"])
-    show_duration = pick(next_word, values["command_show_duration"]) if variant.clue else 0
-    show_delay = pick(next_word, values["command_show_delay"]) if variant.clue else 0
-    explosion_duration = pick(next_word, values["explosion_duration"])
-    explosion_delay = pick(next_word, values["explosion_delay"])
-    return Level(tile, offset, commands, show_duration, show_delay, explosion_duration, explosion_delay)
+    if variant.clue:
+        s.show_duration[lane] = pick(next_word, values["command_show_duration"])
+        s.show_delay[lane] = pick(next_word, values["command_show_delay"])
+    s.explosion_duration[lane] = pick(next_word, values["explosion_duration"])
+    s.explosion_delay[lane] = delay = pick(next_word, values["explosion_delay"])
+    s.timer[lane] = delay + 1  # the first command has a step more than the others
+    set_target(s, lane, tiles.next[start, commands[0]])
+    s.facing[lane] = s.current[lane] = s.completed[lane] = s.length[lane] = s.episode_return[lane] = 0
+    s.burning[lane] = False
+    s.floor[lane] = s.calm_floor[lane]
+    s.count[lane] = len(commands)
+    s.commands[lane, : len(commands)] = commands
+    if variant.clue:
+        write_clue(s, lane, commands)
+        s.clue_step[lane] = 0
+        s.symbol[lane] = s.clue[lane, 0]
+    else:
+        s.vector[lane] = 0.0
+        for step, command in enumerate(commands):
+            s.vector[lane, len(COMMANDS) * step + VECTOR_INDEX[command]] = 1.0
 
 
 def sample_walk(next_word: Callable[[], int], tile: int, count: int, size: int, kinds: int) -> list[int]:
@@ -69,29 +79,3 @@ def moves_inside(size: int, kinds: int) -> list[list[tuple[int, int]]]:
         for x in side
         for y in side
     ]
-
-
-def write_level(s: State, lane: int, level: Level, variant: MortarVariant) -> None:
-    """Starts the lane's episode at this level."""
-    count, tiles = len(level.commands), tile_tables()
-    start = int(s.calm_floor[lane]) + 1 + level.tile  # FLOORS has an arena's calm floor before its tiles
-    s.pos[lane] = tiles.corner[start] + TILE // 2
-    if variant.jitter:
-        s.pos[lane] += level.offset
-    set_target(s, lane, tiles.next[start, level.commands[0]])
-    s.facing[lane] = s.current[lane] = s.completed[lane] = s.length[lane] = s.episode_return[lane] = 0
-    s.burning[lane] = False
-    s.floor[lane] = s.calm_floor[lane]
-    s.count[lane] = count
-    s.commands[lane, :count] = level.commands
-    s.explosion_delay[lane], s.explosion_duration[lane] = level.explosion_delay, level.explosion_duration
-    s.show_duration[lane], s.show_delay[lane] = level.show_duration, level.show_delay
-    s.timer[lane] = level.explosion_delay + 1  # the first command has a step more than the others
-    if variant.clue:
-        write_clue(s, lane, level.commands)
-        s.clue_step[lane] = 0
-        s.symbol[lane] = s.clue[lane, 0]
-    else:
-        s.vector[lane] = 0.0
-        for step, command in enumerate(level.commands):
-            s.vector[lane, len(COMMANDS) * step + VECTOR_INDEX[command]] = 1.0

@@ -20,11 +20,6 @@ class MortarVariant(Variant):
 
     clue: bool = True  # commands are shown one by one before the act task, instead of given as a vector
 
-    @property
-    def jitter(self) -> bool:
-        """Whether the agent starts up to two pixels off its tile's centre."""
-        return self.endless or not (self.clue or self.grid)
-
 
 def option_rows(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
     """The reset options of an id, in the original's order."""
