@@ -142,12 +142,11 @@ class SearingSpotlights(WalkingVectorEnv):
 
     def begin(self, lanes: np.ndarray) -> None:
         """Samples the lanes' next levels and starts their episodes."""
+        s = self.state
         for lane in lanes.tolist():
-            values = self.settings[lane]
-            level = levels.sample_level(self._rngs[lane], values, self.variant)
-            levels.write_level(self.state, lane, level, values)
+            levels.start_episode(s, lane, self._rngs[lane], self.settings[lane], self.variant.endless)
             self._draw_scenery(lane)
-            if not level.coins:
+            if not s.num_coins[lane]:
                 self._unlocked.append(lane)
 
     def apply_rules(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

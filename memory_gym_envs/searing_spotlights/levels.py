@@ -6,7 +6,7 @@ All is sampled in the original's order, so that a seed means the same level here
 import math
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.searing_spotlights.rules import coin_show_limit, start_wait, update_targets
 from memory_gym_envs.searing_spotlights.state import AGENT, COIN, EXIT, GONE, NO_KEY, NO_SPOT, RADIUS, State
 from memory_gym_envs.state import make_room
-from memory_gym_envs.variant import Variant
 from memory_gym_envs.words import pick, sample_below, word_source
 
 MIDDLE = SCREEN // 2
@@ -28,37 +27,57 @@ AGENT_SPACE, COIN_SPACE = 28, 21  # pixels around a position where nothing else 
 Position = tuple[int, int]  # x and y in pixels
 
 
-class Level(NamedTuple):
-    """What the generator decides at a reset."""
-
-    facing: int
-    pos: Position  # the agent's
-    spots: list[list[float]]  # each a column of State.spots
-    coins: list[Position]
-    exit: Position | None
-    delay: int  # steps added to the first interval between spotlights
-
-
-def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
-    """Samples a level of the given options."""
+def start_episode(s: State, lane: int, rng: np.random.Generator, values: dict[str, Any], endless: bool) -> None:
+    """Starts the lane's next episode, with these reset options."""
     next_word = word_source(rng)
-    facing = sample_below(next_word, FACINGS)
+    # Before the first step the agent is drawn facing up wherever it faces, as in the original.
+    if s.drawn_facing is s.facing:
+        s.drawn_facing = s.drawn_facing.copy()
+    s.facing[lane], s.drawn_facing[lane] = sample_below(next_word, FACINGS), 0
     if values["sample_agent_position"]:
         pos, free = sample_position(next_word, None, AGENT_SPACE)
     else:
-        pos = (MIDDLE, MIDDLE)
-        free = occupied(None, pos, COIN_SPACE)
-    spots = [sample_spot(rng, values) for _ in range(values["initial_spawns"])]
-    if variant.endless:
-        coin = [sample_coin(next_word, None)] if values["coin_enabled"] else []
-        return Level(facing, pos, spots, coin, None, pick(next_word, values["spawn_delay"]))
-    things = []
-    coins = pick(next_word, values["num_coins"]) if values["num_coins"] else 0
-    for _ in range(coins + values["use_exit"]):
-        position, free = sample_position(next_word, free, COIN_SPACE)
-        things.append(inside(position))
-    exit_ = things.pop() if values["use_exit"] else None
-    return Level(facing, pos, spots, things, exit_, pick(next_word, values["spawn_delay"]))
+        pos, free = (MIDDLE, MIDDLE), occupied(None, (MIDDLE, MIDDLE), COIN_SPACE)
+    s.bodies[:, lane], s.targets[lane] = GONE, 0.0
+    s.bodies[:, lane, AGENT] = pos
+    for axis in range(2):
+        s.pos[lane, axis] = pos[axis] + PAD
+    write_spots(s, lane, [sample_spot(rng, values) for _ in range(values["initial_spawns"])])
+    if endless:
+        coins = [sample_coin(next_word, None)] if values["coin_enabled"] else []
+    else:
+        coins = []
+        num_coins = pick(next_word, values["num_coins"]) if values["num_coins"] else 0
+        for _ in range(num_coins + values["use_exit"]):
+            position, free = sample_position(next_word, free, COIN_SPACE)
+            coins.append(inside(position))
+        if values["use_exit"]:
+            s.bodies[:, lane, EXIT] = s.targets[lane, 2:] = coins.pop()
+    for coin, position in enumerate(coins):
+        s.bodies[:, lane, COIN + coin] = position
+    s.num_coins[lane] = s.coins_left[lane] = len(coins)
+    s.coin_show_limit[lane] = coin_show_limit(values, first=True)
+    update_targets(s, lane)
+    s.spawns_left[lane] = values.get("num_spawns", NO_LIMIT)
+    start_wait(s, lane, pick(next_word, values["spawn_delay"]))
+    s.health[lane] = s.full_health[lane]
+    s.floor[lane] = 2 * lane
+    for field in (s.collected, s.coin_age, s.success, s.is_open, s.lost_width, s.length):
+        field[lane] = 0
+    s.last_action[lane] = s.shown_action[lane] = s.shown_gain[lane] = 0
+    s.last_gain[lane], s.episode_return[lane] = 1, 0.0
+
+
+def write_spots(s: State, lane: int, spots: list[list[float]]) -> None:
+    """Makes these the lane's spotlights, each a column of State.spots. They shine from the first step on."""
+    count = len(spots)
+    if count > s.spot_key.shape[1]:
+        make_room(s, "S", count)
+    s.spots[:, lane], s.spot_key[lane], s.num_spots[lane] = NO_SPOT[:, None], NO_KEY, count
+    if count:
+        s.spots[:, lane, :count] = np.array(spots).T
+        s.spot_key[lane, :count] = [spot[RADIUS] * POSITIONS + POSITION_0 for spot in spots]
+    s.spot_place[:, lane], s.near_light[lane] = 0, False
 
 
 def sample_position(next_word: Callable[[], int], free: np.ndarray | None, space: int) -> tuple[Position, np.ndarray]:
@@ -136,39 +155,3 @@ def _unit(degrees: int) -> tuple[float, float]:
 
 
 UNITS = [_unit(degrees) for degrees in range(720)]
-
-
-def write_level(s: State, lane: int, level: Level, values: dict[str, Any]) -> None:
-    """Starts the lane's episode at this level, with these reset options."""
-    coins, spots = len(level.coins), len(level.spots)
-    if spots > s.spot_key.shape[1]:
-        make_room(s, "S", spots)
-    # Before the first step the agent is drawn facing up wherever it faces, as in the original.
-    if s.drawn_facing is s.facing:
-        s.drawn_facing = s.drawn_facing.copy()
-    s.facing[lane], s.drawn_facing[lane] = level.facing, 0
-    s.bodies[:, lane] = GONE
-    s.bodies[:, lane, AGENT] = level.pos
-    for axis in range(2):
-        s.pos[lane, axis] = level.pos[axis] + PAD
-    for coin, position in enumerate(level.coins):
-        s.bodies[:, lane, COIN + coin] = position
-    s.targets[lane] = 0.0
-    if level.exit is not None:
-        s.bodies[:, lane, EXIT] = s.targets[lane, 2:] = level.exit
-    s.num_coins[lane] = s.coins_left[lane] = coins
-    s.coin_show_limit[lane] = coin_show_limit(values, first=True)
-    update_targets(s, lane)
-    s.spots[:, lane], s.spot_key[lane], s.num_spots[lane] = NO_SPOT[:, None], NO_KEY, spots
-    if spots:
-        s.spots[:, lane, :spots] = np.array(level.spots).T
-        s.spot_key[lane, :spots] = [spot[RADIUS] * POSITIONS + POSITION_0 for spot in level.spots]
-    s.spot_place[:, lane], s.near_light[lane] = 0, False  # they shine from the first step on
-    s.spawns_left[lane] = values.get("num_spawns", NO_LIMIT)
-    start_wait(s, lane, level.delay)
-    s.health[lane] = s.full_health[lane]
-    s.floor[lane] = 2 * lane
-    for field in (s.collected, s.coin_age, s.success, s.is_open, s.lost_width, s.length):
-        field[lane] = 0
-    s.last_action[lane] = s.shown_action[lane] = s.shown_gain[lane] = 0
-    s.last_gain[lane], s.episode_return[lane] = 1, 0.0
