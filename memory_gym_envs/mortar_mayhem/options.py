@@ -1,6 +1,6 @@
 """What tells one id from another: its reset options and the entries of its vector observation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from memory_gym_envs.appearance import agent_entries
 from memory_gym_envs.character import LARGEST_RADIUS
@@ -8,7 +8,7 @@ from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.entries import Entries
 from memory_gym_envs.mortar_mayhem.arena import ARENA_SIZES, COMMANDS
 from memory_gym_envs.options import Option
-from memory_gym_envs.variant import Variant, agent_scale, agent_speed, applicable, max_steps
+from memory_gym_envs.variant import AGENT_SCALE, AGENT_SPEED, MAX_STEPS, Variant, applicable
 
 VECTOR_ORDER = ("stay", "right", "left", "up", "down", "right_down", "right_up", "left_down", "left_up")
 VECTOR_COMMANDS = 20  # commands that the command vector has room for
@@ -29,9 +29,9 @@ def option_rows(grid: bool, clue: bool, endless: bool) -> tuple[Option, ...]:
     last_command = "reward added with the last command's"
     new_command = "reward added when the newest command, a sequence's last, is carried out"
     rows = [
-        (endless, max_steps(-1)),
-        (True, agent_scale(ignored=grid)),
-        (not grid, agent_speed()),
+        (endless, MAX_STEPS),
+        (True, replace(AGENT_SCALE, ignored=grid)),
+        (not grid, AGENT_SPEED),
         (not endless, Option("arena_size", 5, "int", smallest, largest, "tiles along one side of the arena")),
         (True, Option("allowed_commands", 5 if grid else 9, "int", 4, 9, "how many kinds of command may occur")),
         (not endless, Option("command_count", (10,), "ints", 1, most, "commands to do")),

@@ -1,11 +1,13 @@
 """The ids of Mystery Path: their tiles, reset options and entries of a vector observation."""
 
+from dataclasses import replace
+
 from memory_gym_envs.appearance import agent_entries
 from memory_gym_envs.character import LARGEST_RADIUS, PAD, SPAN
 from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.entries import Entries
 from memory_gym_envs.options import Option
-from memory_gym_envs.variant import Variant, agent_scale, agent_speed, applicable, max_steps
+from memory_gym_envs.variant import AGENT_SCALE, AGENT_SPEED, MAX_STEPS, Variant, applicable
 
 TILE = 12  # pixels
 SIDE = 7  # tiles along one side of the screen, and of a segment of the endless path
@@ -24,9 +26,9 @@ def option_rows(grid: bool, endless: bool) -> tuple[Option, ...]:
     sides = "where the path starts: 0 left, 1 right, 2 top, 3 bottom"
     camera = "how many tiles from the screen's left edge the agent is drawn"
     rows = [
-        (True, max_steps(steps)),
-        (True, agent_scale(ignored=grid)),
-        (not grid, agent_speed()),
+        (True, replace(MAX_STEPS, default=steps)),
+        (True, replace(AGENT_SCALE, ignored=grid)),
+        (not grid, AGENT_SPEED),
         (not endless, Option("cardinal_origin_choice", (0, 1, 2, 3), "ints", 0, 3, sides)),
         (True, Option("show_origin", False, "bool", None, None, origin, ignored=endless)),
         (not endless, Option("show_goal", False, "bool", None, None, "show the path's goal in green")),

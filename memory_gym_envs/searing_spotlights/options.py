@@ -1,10 +1,11 @@
 """The ids of Searing Spotlights: their reset options and the entries of their vectors."""
 
+from dataclasses import replace
 from typing import Any
 
 from memory_gym_envs.entries import Entries
 from memory_gym_envs.options import Option
-from memory_gym_envs.variant import Variant, agent_scale, agent_speed, applicable, max_steps
+from memory_gym_envs.variant import AGENT_SCALE, AGENT_SPEED, MAX_STEPS, Variant, applicable
 
 SPOT_RADII = (1, 42)  # pixels; the largest spotlight is as wide as the screen
 MOST_COINS = 20
@@ -17,7 +18,7 @@ def light_rows(endless: bool) -> list[tuple[bool, Option]]:
     deadline = "steps to collect a coin in; -1: no limit"
     delay = "steps added to an interval between spotlights, sampled for each"
     return [
-        (True, max_steps(-1 if endless else 256)),
+        (True, replace(MAX_STEPS, default=-1 if endless else 256)),
         (endless, Option("steps_per_coin", 160, "int", 1, None, deadline, also=(-1,))),
         (True, Option("initial_spawns", 3 if endless else 4, "int", 0, 100, "spotlights at the start")),
         (finite, Option("num_spawns", 30, "int", 0, None, "spotlights that follow")),
@@ -54,9 +55,9 @@ def body_rows(endless: bool) -> list[tuple[bool, Option]]:
         (finite, Option("use_exit", True, "bool", None, None, "false: the last coin ends the episode")),
         (finite, Option("exit_scale", 0.5, "float", 0.1, 2.0, "size of the exit; 0.5: 10 pixels wide")),
         (finite, Option("exit_visible", False, "bool", None, None, "the exit is visible in the dark")),
-        (True, agent_speed()),
+        (True, AGENT_SPEED),
         (True, Option("agent_health", 10 if endless else 5, "int", 1, None, "health at the start")),
-        (True, agent_scale()),
+        (True, AGENT_SCALE),
         (True, Option("agent_visible", False, "bool", None, None, "the agent is visible in the dark")),
         (True, Option("sample_agent_position", True, "bool", None, None, "false: the agent starts in the middle")),
         (True, Option("show_last_action", True, "bool", None, None, "show the action before the last in the top bar")),
@@ -90,7 +91,7 @@ def entry_rows(endless: bool) -> tuple[Entries, ...]:
         (True, "dusk", 1, "brightness of the floor outside of the light, while any is visible"),
         (True, "alarm", 1, "1 where red floor is visible"),
     ]
-    return applicable((has_it, Entries(*row)) for has_it, *row in table)
+    return tuple(Entries(*row) for has_it, *row in table if has_it)
 
 
 def make_variant(endless: bool) -> Variant:
