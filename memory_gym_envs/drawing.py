@@ -39,10 +39,7 @@ def ring(size: int, x: float, y: float, radius: int, width: int) -> np.ndarray:
 
 
 def _outline(solid: np.ndarray, x: float, y: float) -> np.ndarray:
-    """The edge of a disk, walked octant by octant.
-
-    Of each column it has the outermost pixel, and beside the diagonals of each row.
-    """
+    """The edge of a disk: the outermost pixel of each column and, beside the diagonals, of each row."""
     columns, rows = np.arange(len(solid)) + 0.5 - x, (np.arange(len(solid)) + 0.5 - y)[:, None]
     around = np.pad(solid, 1)
     above = np.where(rows < 0, around[:-2, 1:-1], around[2:, 1:-1])  # the next pixel away from the centre
@@ -179,10 +176,7 @@ def stamp(frames: np.ndarray, picture: np.ndarray, owner: np.ndarray, x: np.ndar
 
 
 def squares_of(images: np.ndarray, across: int, row: np.dtype) -> np.ndarray:
-    """Every W x W square of a contiguous stack of images, by its first pixel: (starts, W) rows, a view.
-
-    images: uint8 of any shape, in memory a stack of (across, across, 3).
-    """
+    """All W x W squares of images, in memory a stack of (across, across, 3), by their first pixel: (starts, W), a view."""
     width = row.itemsize // 3
     starts = images.size // 3 - (width - 1) * (across + 1)
     return np.ndarray((starts, width), row, images, 0, (3, 3 * across))

@@ -12,17 +12,13 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Entries:
-    """Neighbouring entries of the vector that belong together.
-
-    name, width: what they are called, and how many there are.
-    low, high: what each of them lies between, both ends included.
-    """
+    """Neighbouring entries of the vector that belong together."""
 
     name: str
-    width: int
+    width: int  # how many there are
     meaning: str
-    low: float = 0.0
-    high: float = 1.0
+    low: float = 0.0  # each of them is at least that
+    high: float = 1.0  # and at most that
 
 
 def vector_space(rows: tuple[Entries, ...]) -> gym.spaces.Box:

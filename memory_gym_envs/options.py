@@ -19,24 +19,17 @@ LARGEST = 10**9  # sums of numbers up to that stay exact enough for rewards, and
 
 @dataclass(frozen=True)
 class Option:
-    """One reset parameter.
-
-    kind: "bool", "int", "float" or "ints" (a list of integers, one of which is sampled at every reset).
-    low, high: the allowed range, both ends included; None: as far as LARGEST on that side.
-    also: single values allowed besides the range.
-    empty: whether a list may have no entries.
-    ignored: accepted without an effect, as in the original.
-    """
+    """One reset parameter."""
 
     name: str
     default: Any
-    kind: str
-    low: float | None
-    high: float | None
+    kind: str  # "bool", "int", "float", or "ints": a list of integers, one of which is sampled at every reset
+    low: float | None  # the least allowed value; None: -LARGEST
+    high: float | None  # the largest; None: LARGEST
     meaning: str
-    also: tuple[int, ...] = ()
-    empty: bool = False
-    ignored: bool = False
+    also: tuple[int, ...] = ()  # single values that are allowed besides
+    empty: bool = False  # a list may have no entries
+    ignored: bool = False  # accepted without an effect, as in the original
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -61,10 +54,7 @@ class Option:
         return 0 if self.empty else 1
 
     def parse(self, value: Any) -> Any:
-        """Returns the value as plain Python (bool, int, float or tuple of int), or None if it is not allowed.
-
-        A whole float is an integer, and a range is a list.
-        """
+        """The value as bool, int, float or tuple of int; None if it is not allowed. Whole floats are integers, too."""
         if self.kind == "bool":
             return bool(value) if isinstance(value, (bool, np.bool_)) else None
         if self.kind == "ints":

@@ -181,10 +181,7 @@ class SearingSpotlightsEnv(MemoryGymEnv):  # noqa: D101
 
 
 def register(environment: type[MemoryGymEnv], namespace: str | None = None) -> None:
-    """Registers the ids of the environment's family with Gymnasium, for `gym.make` and `gym.make_vec`.
-
-    namespace: what stands before a slash in front of each id.
-    """
+    """Registers the family's ids, as `namespace/id` if there is one, for `gym.make` and `gym.make_vec`."""
     one, many = (f"{made.__module__}:{made.__name__}" for made in (environment, environment.family))
     for variant in environment.family.variants:
         name = f"{namespace}/{variant}" if namespace else variant

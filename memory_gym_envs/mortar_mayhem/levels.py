@@ -57,10 +57,7 @@ def start_episode(
 
 
 def sample_walk(next_word: Callable[[], int], tile: int, count: int, size: int, kinds: int) -> list[int]:
-    """So many commands that lead from the tile through the arena without leaving it.
-
-    tile: column * size + row. kinds: how many kinds of command may occur.
-    """
+    """So many of the first `kinds` COMMANDS, which lead from the tile (column * size + row) and stay in the arena."""
     moves = moves_inside(size, kinds)
     commands = []
     for _ in range(count):

@@ -1,4 +1,4 @@
-"""Rules: what a step does to the state. All functions change it in place.
+"""Rules: what a step does to the state. All functions change it in place, likewise `rewards` and `terminated`, (N,).
 
 Shape letters: N lanes, n some of them, L steps of the longest clue.
 """
@@ -42,10 +42,7 @@ def on_target(s: State, lanes: Lanes) -> np.ndarray:
 
 
 def ignite_tiles(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sets all tiles but the target on fire, which checks the command.
-
-    Returns the rewards for the commands (n,) and whose sequence is at its end, (n,) bool.
-    """
+    """Sets all tiles but the target on fire, which checks the command: rewards (n,), whose sequence is over (n,)."""
     s.current[lanes] += 1
     s.burning[lanes] = True
     s.timer[lanes] = s.explosion_duration[lanes]
@@ -73,10 +70,7 @@ def set_target(s: State, lanes: np.ndarray | int, tile: np.ndarray | int) -> Non
 
 
 def burn_agents(s: State, acting: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
-    """Ends the episodes of agents on burning tiles. rewards, terminated: (N,), changed in place.
-
-    acting: (N,) or one bool for all: who may act.
-    """
+    """Ends the episodes of agents on burning tiles. acting: who may act, (N,) or one bool for all."""
     in_danger = s.burning & acting
     if np.count_nonzero(in_danger):
         failed = in_danger & ~on_target(s, ALL)

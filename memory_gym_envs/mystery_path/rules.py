@@ -1,5 +1,6 @@
 """Mystery Path's rules: what a step does to the state.
 
+lane_path, (N,), is where each lane's steps start in the flattened State.path_cell.
 Shape letters: N lanes, n some of them, K steps back along the path, T tiles of the trails.
 """
 
@@ -31,10 +32,7 @@ def walk_endless(s: State, action: np.ndarray) -> None:
 
 
 def enter_tiles(s: State, lane_path: np.ndarray, rewards: np.ndarray, endless: bool) -> None:
-    """What happens on another tile, or in the pit. It changes nothing for agents that are where they were.
-
-    lane_path: (N,) where the lane's steps start in the flattened path. rewards: (N,), changed in place.
-    """
+    """What happens on another tile, or in the pit. Nothing changes for agents that are where they were."""
     s.last_path_step = np.where(s.fallen, s.last_path_step, s.path_step)
     here, now = s.path_step + lane_path, s.fails + 1
     before = s.reached.take(here)

@@ -98,10 +98,7 @@ def spot_shapes(least: int, largest: int) -> tuple[list[np.ndarray], list[np.nda
 
 
 def draw_coins_and_exits(scales: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.ndarray]:
-    """For each pair of scales the sprites of a coin, a closed exit and an open one.
-
-    Their colours (R, W, W, 3) uint8, and the (R, W, W) mask of what is drawn.
-    """
+    """A coin, a closed exit and an open one for each pair of scales: sprites (R, W, W, 3) uint8 and masks (R, W, W)."""
     width = 2 * max(int(10 * scale) for pair in scales for scale in pair) + 2
     images = np.zeros((3 * len(scales), width, width, 3), np.uint8)
     solids = np.zeros(images.shape[:3], bool)

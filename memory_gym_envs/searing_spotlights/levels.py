@@ -1,6 +1,7 @@
 """Levels: what the generator decides at a reset and when a coin or a spotlight appears.
 
 All is sampled in the original's order, so that a seed means the same level here.
+`free` are the pixels where something may be put, (84, 84) bool; None: all.
 """
 
 import math
@@ -81,10 +82,7 @@ def write_spots(s: State, lane: int, spots: list[list[float]]) -> None:
 
 
 def sample_position(next_word: Callable[[], int], free: np.ndarray | None, space: int) -> tuple[Position, np.ndarray]:
-    """A position near a free pixel, and which pixels are free once those around it are occupied.
-
-    free: (84, 84) bool, or None: every pixel is free. space: pixels around the position.
-    """
+    """A position near a free pixel, and which pixels are free once those less than `space` away are occupied."""
     cells = () if free is None else np.flatnonzero(free)
     # Where nothing is free, the original fails.
     cell = int(cells[sample_below(next_word, len(cells))]) if len(cells) else sample_below(next_word, SCREEN * SCREEN)
@@ -93,10 +91,7 @@ def sample_position(next_word: Callable[[], int], free: np.ndarray | None, space
 
 
 def occupied(free: np.ndarray | None, pos: Position, space: int) -> np.ndarray:
-    """Which pixels are free, (84, 84) bool, once those less than `space` away from the position are occupied.
-
-    free: (84, 84) bool, or None: every pixel is free.
-    """
+    """Which pixels are free once those less than `space` away from the position are occupied."""
     left, top = SCREEN - 1 - pos[0], SCREEN - 1 - pos[1]
     far = _distant(space)[top : top + SCREEN, left : left + SCREEN]
     return far if free is None else free & far

@@ -1,4 +1,7 @@
-"""Rules: what the options mean for a lane, and what a step does to the state. Shape letters as in state.py."""
+"""Rules: what the options mean for a lane, and what a step does to the state.
+
+It is changed in place, and so are `rewards` and `terminated`, (N,) each. Shape letters as in state.py.
+"""
 
 from typing import Any
 
@@ -115,7 +118,7 @@ def remove_finished(s: State) -> tuple[np.ndarray, np.ndarray]:
 
 
 def burn(s: State, lanes: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
-    """Damages the agents of these lanes (n,), which are in the light. rewards and terminated (N,) change in place."""
+    """Damages the agents of these lanes (n,), which are in the light."""
     s.health[lanes] -= s.damage[lanes]
     s.floor[lanes] += 1
     lost = 1 - s.health[lanes] / s.full_health[lanes]
@@ -173,10 +176,7 @@ def update_targets(s: State, lane: int) -> None:
 
 
 def leave(s: State, touched: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
-    """Ends the episodes whose agent stands at the open exit or, without an exit, has just taken the last coin.
-
-    touched: (N, B) bool. rewards and terminated (N,) change in place.
-    """
+    """Ends the episodes whose agent stands at the open exit or, without an exit, has just taken the last coin."""
     has_exit = s.bodies[0, :, EXIT] != GONE
     done = (s.coins_left == 0) & np.where(has_exit, touched[:, EXIT], s.num_coins > 0)
     rewards += s.reward_exit * (done & has_exit)
@@ -184,14 +184,8 @@ def leave(s: State, touched: np.ndarray, rewards: np.ndarray, terminated: np.nda
     terminated |= done
 
 
-# ---- counting ----
-
-
 def count_step(s: State, rewards: np.ndarray, terminated: np.ndarray, shown: dict[int, float], endless: bool) -> None:
-    """Counts the step. terminated (N,) changes in place.
-
-    shown: by lane, rewards that the top bar shows instead of the lane's own.
-    """
+    """Counts the step. shown: by lane, rewards that the top bar shows instead of the lane's own."""
     if endless:
         s.coin_age += 1
         terminated |= s.coin_age == s.coin_limit
