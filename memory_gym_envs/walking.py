@@ -51,10 +51,9 @@ class WalkingVectorEnv(MemoryGymVectorEnv):
         """One step of the rules, but for the limit of steps: rewards and terminations, (N,) each. action: (N,)."""
         raise NotImplementedError
 
-    # ---- what is the same for all ----
+    # ---- what is the same for all; base.py describes the methods that have no docstring here ----
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
-        """The observation space of one lane with pixels, and its action space."""
         actions = gym.spaces.Discrete(4) if self.variant.grid else gym.spaces.MultiDiscrete([3, 3])
         return gym.spaces.Box(0, 255, (SCREEN, SCREEN, 3), np.uint8), actions
 
@@ -70,7 +69,6 @@ class WalkingVectorEnv(MemoryGymVectorEnv):
         return Figure(scale, values["agent_speed"], low, high, character.radius_of(scale), torus)
 
     def place_tables(self) -> None:
-        """Looks up the tables that follow from the options, and where each lane's rows start in them."""
         every, numbers = numbered([self.figures_of(values) for values in self.settings])
         self.figures = tuple(figure for each in every for figure in each)  # the different ones of all lanes
         axes = np.arange(len(every[0]))
@@ -82,7 +80,6 @@ class WalkingVectorEnv(MemoryGymVectorEnv):
             self._vector_tables = self.vector_tables()
 
     def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Applies the rules for one step: rewards, terminations, truncations, each (N,)."""
         s = self.state
         s.length += 1
         rewards, terminated = self.apply_rules(actions if actions.ndim == 1 else actions.dot(BRANCHES))

@@ -1,6 +1,6 @@
-"""The class of the family: what Gymnasium asks of it, for N lanes at once.
+"""The Mortar Mayhem environments. base.py and walking.py describe the methods that have no docstring here.
 
-Shape letters: N lanes, n some of them, V entries of a vector observation.
+Shape letters: N lanes, n some of them.
 """
 
 from typing import Any
@@ -104,7 +104,6 @@ class MortarMayhem(WalkingVectorEnv):
     variant: MortarVariant
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
-        """The observation space of one lane with pixels, of the act task alone a Dict, and its action space."""
         image, actions = super().spaces()
         if self.variant.clue:
             return image, actions
@@ -112,7 +111,6 @@ class MortarMayhem(WalkingVectorEnv):
         return gym.spaces.Dict({"visual_observation": image, "vector_observation": vector}), actions
 
     def allocate(self) -> None:
-        """Makes the state of N lanes."""
         self.state = empty(State, N=self.num_envs, C=1, L=1)
         self._clues_open = False  # whether any lane may still have a clue to see
 
@@ -128,25 +126,21 @@ class MortarMayhem(WalkingVectorEnv):
         s.calm_floor[lanes] = FLOORS.index((size, None))
 
     def figures_of(self, values: dict[str, Any]) -> tuple[Figure, ...]:
-        """The agent's figure under these options."""
         size = values.get("arena_size", TORUS_SIZE)
         low = first_pixel(size)
         return (self.figure_of(values, low, low + TILE * size, torus=self.variant.endless),)
 
     def place_tables(self) -> None:
-        """Looks up the tables that follow from the options, and where each lane's rows start in them."""
         super().place_tables()
         self._lane_clue = np.arange(self.num_envs) * self.state.clue.shape[1]  # (N,)
 
     def vector_tables(self) -> VectorTables:
-        """The tables of vector observations."""
         sprites = FACINGS * (len(drawing.symbols()) if self.variant.clue else 1)  # of each figure
         appearance = vectors.appearance_tables(self.figures, self.variant.clue)
         scales = [figure.scale for figure in self.figures]
         return vector_tables(self.variant.entries, appearance, self.state.figure * sprites, scales, TILE)
 
     def begin(self, lanes: np.ndarray) -> None:
-        """Samples the lanes' next levels and starts their episodes."""
         for lane in lanes.tolist():
             levels.start_episode(self.state, lane, self._rngs[lane], self.settings[lane], self.variant)
         self._clues_open = self.variant.clue
@@ -191,18 +185,15 @@ class MortarMayhem(WalkingVectorEnv):
                 terminated[lanes] = sequence_over
 
     def pixels(self, lanes: Lanes) -> Any:
-        """Fresh observations of the lanes with pixels, of the act task alone as a Dict."""
         if self.variant.clue:
             return self.frames(lanes)
         vector = self.state.vector[lanes]
         return {"visual_observation": self.frames(lanes), "vector_observation": vector.copy()}
 
     def vectors(self, lanes: Lanes) -> np.ndarray:
-        """Fresh vector observations of the lanes, (n, V) float32."""
         return vectors.make_vectors(self.state, self._vector_tables, lanes)
 
     def frames(self, lanes: Lanes) -> np.ndarray:
-        """Fresh frames of the lanes, (n, 84, 84, 3) uint8."""
         return drawing.draw(self.state, self._agent_tables.sheet, lanes)
 
     def ground_truth(self) -> np.ndarray:
@@ -210,7 +201,6 @@ class MortarMayhem(WalkingVectorEnv):
         return self.state.truth.copy()
 
     def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
-        """The lanes' ended episodes in numbers, each (n,)."""
         s, numbers = self.state, super().summary(lanes)
         if self.variant.endless:
             completed = s.completed[lanes]  # a failure does not raise it, unlike the share below
@@ -238,7 +228,6 @@ class MortarMayhem(WalkingVectorEnv):
         return numbers | {"commands_left": s.count - s.current, "carried_out": s.completed.copy()}
 
     def longest_episode(self, lane: int) -> int:
-        """The steps after which the lane's episode is over at the latest, under its reset options; -1: no limit."""
         if self.variant.endless:
             return super().longest_episode(lane)
         values = {name: max(value) for name, value in self.settings[lane].items() if isinstance(value, tuple)}

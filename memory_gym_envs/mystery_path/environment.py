@@ -1,4 +1,4 @@
-"""The Mystery Path environments."""
+"""The Mystery Path environments. base.py and walking.py describe the methods that have no docstring here."""
 
 from typing import Any
 
@@ -87,12 +87,10 @@ class MysteryPath(WalkingVectorEnv):
     tile = TILE
 
     def spaces(self) -> tuple[gym.Space, gym.Space]:
-        """The observation space of one lane with pixels, and its action space."""
         image, actions = super().spaces()
         return image, gym.spaces.Discrete(4) if self.variant.endless else actions
 
     def allocate(self) -> None:
-        """Makes the state of N lanes."""
         segments = levels.FIRST_SEGMENTS + 1 if self.variant.endless else 1
         self.state = empty(State, N=self.num_envs, P=SIDE * SIDE + 1, M=segments * SEGMENT * ROWS, T=0)
         self.state.path_cell[:, PIT] = NO_CELL
@@ -106,11 +104,9 @@ class MysteryPath(WalkingVectorEnv):
             drawing.set_camera(s, lanes, values)
 
     def figures_of(self, values: dict[str, Any]) -> tuple[Figure, ...]:
-        """The agent's figure under these options."""
         return (self.figure_of(values, 0, SCREEN),)
 
     def place_tables(self) -> None:
-        """Looks up the tables that follow from the options, and where each lane's rows start in them."""
         endless = self.variant.endless
         every = [vectors.view_options_of(values, self.scale_of(values), endless) for values in self.settings]
         self.view_options, self.state.view[:] = numbered(every)
@@ -123,12 +119,10 @@ class MysteryPath(WalkingVectorEnv):
         self._lane_path = np.arange(self.num_envs) * self.state.path_cell.shape[1]  # (N,)
 
     def vector_tables(self) -> VectorTables:
-        """The tables of vector observations."""
         appearance, scales = vectors.appearance_tables(self.view_options), [view.scale for view in self.view_options]
         return vector_tables(self.variant.entries, appearance, self.state.view * (2 * FACINGS), scales, TILE)
 
     def begin(self, lanes: np.ndarray) -> None:
-        """Samples the lanes' next levels and starts their episodes."""
         rules.forget_trails(self.state, lanes)
         for lane in lanes.tolist():
             level = levels.sample_level(self._rngs[lane], self.settings[lane], self.variant)
@@ -169,11 +163,9 @@ class MysteryPath(WalkingVectorEnv):
             self._index_lanes()
 
     def vectors(self, lanes: Lanes) -> np.ndarray:
-        """Fresh vector observations of the lanes, (n, V) float32."""
         return vectors.make_vectors(self.state, self._vector_tables, lanes, self.variant.endless)
 
     def frames(self, lanes: Lanes) -> np.ndarray:
-        """Fresh frames of the lanes, (n, 84, 84, 3) uint8."""
         return drawing.draw(self.state, self._agent_tables.sheet, lanes, self.variant.endless)
 
     def ground_truth(self) -> np.ndarray:
@@ -181,7 +173,6 @@ class MysteryPath(WalkingVectorEnv):
         return TRUTHS[self.variant.endless].take(self.state.next_direction, axis=0)
 
     def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
-        """The lanes' ended episodes in numbers, each (n,)."""
         s, numbers = self.state, super().summary(lanes)
         if self.variant.endless:
             numbers |= {"num_fails": s.fails[lanes]}

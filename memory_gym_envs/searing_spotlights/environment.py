@@ -1,4 +1,4 @@
-"""Searing Spotlights as a batch of lanes."""
+"""The Searing Spotlights environments. base.py and walking.py describe the methods that have no docstring here."""
 
 from typing import Any
 
@@ -118,7 +118,6 @@ class SearingSpotlights(WalkingVectorEnv):
         return self.figure_of(values, 0, SCREEN), self.figure_of(values, TOP_BAR, SCREEN)
 
     def place_tables(self) -> None:
-        """The tables that step() looks things up in, and where each lane's rows start in them."""
         coins = [values["coin_scale"] for values in self.settings]
         exits = [values.get("exit_scale", values["coin_scale"]) for values in self.settings]
         self.scales, scale = numbered([*zip(coins, exits, strict=True)])
@@ -136,12 +135,10 @@ class SearingSpotlights(WalkingVectorEnv):
         self._calm = np.arange(0, 2 * self.num_envs, 2)  # (N,) the scenery's calm rows
 
     def vector_tables(self) -> vectors.VectorTables:
-        """The tables of vector observations."""
         figure_scales = tuple(across.scale for across in self.figures[::2])
         return vectors.make_vector_tables(self.state, self.variant, self._radii, figure_scales, self.scales)
 
     def begin(self, lanes: np.ndarray) -> None:
-        """Samples the lanes' next levels and starts their episodes."""
         s = self.state
         for lane in lanes.tolist():
             levels.start_episode(s, lane, self._rngs[lane], self.settings[lane], self.variant.endless)
@@ -214,14 +211,12 @@ class SearingSpotlights(WalkingVectorEnv):
             drawing.draw_scenery(self.state, self._drawing, lane)
 
     def frames(self, lanes: Lanes) -> np.ndarray:
-        """Fresh frames of the lanes, (n, 84, 84, 3)."""
         if self.obs_type == "vector":
             for lane in np.arange(self.num_envs)[lanes].tolist():
                 drawing.draw_scenery(self.state, self._drawing, lane)
         return drawing.draw(self.state, self._drawing, lanes)
 
     def vectors(self, lanes: Lanes) -> np.ndarray:
-        """Fresh vector observations of the lanes, (n, V) float32: see VARIANTS[id].entries."""
         return vectors.make_vectors(self.state, self._vector_tables, lanes)
 
     def ground_truth(self) -> np.ndarray:
@@ -234,7 +229,6 @@ class SearingSpotlights(WalkingVectorEnv):
         return truth
 
     def summary(self, lanes: np.ndarray) -> dict[str, np.ndarray]:
-        """The lanes' ended episodes in numbers."""
         s, numbers = self.state, super().summary(lanes)
         numbers["agent_health"] = (s.health / s.full_health)[lanes]
         if self.variant.endless:
