@@ -176,7 +176,7 @@ def stamp(frames: np.ndarray, picture: np.ndarray, owner: np.ndarray, x: np.ndar
 
 
 def squares_of(images: np.ndarray, across: int, row: np.dtype) -> np.ndarray:
-    """All W x W squares of images, in memory a stack of (across, across, 3), by their first pixel: (starts, W), a view."""
+    """A view of all W x W squares of images, in memory (..., across, across, 3), by their first pixel: (starts, W)."""
     width = row.itemsize // 3
     starts = images.size // 3 - (width - 1) * (across + 1)
     return np.ndarray((starts, width), row, images, 0, (3, 3 * across))
