@@ -2,8 +2,8 @@
 
 A family says what its options, spaces, state, rules and pictures are; everything that Gymnasium asks of a vector
 environment (seeds, levels, options kept from reset to reset, same-step autoreset, infos, rendering) is here, once.
-Shape letters: N lanes (parallel environments), n some of them, G entries of the ground truth, V of a vector
-observation.
+Shape letters, in the families too: N lanes (parallel environments), n some of them, G entries of the ground truth, V of
+a vector observation. A family's state.py has more.
 """
 
 import inspect

@@ -1,8 +1,4 @@
-"""Vector observations: what the flat vector of an id is made of, one table row for each group of entries.
-
-A family lists an id's rows as a tuple of `Entries`, in the vector's order. The observation space and the documentation
-are made from them.
-"""
+"""What the vector observation of an id is made of: a row for each group of entries, in the vector's order."""
 
 from dataclasses import dataclass
 

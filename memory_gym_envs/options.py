@@ -1,9 +1,4 @@
-"""Reset options: one table row each, checked before anything changes.
-
-A family lists its options as a tuple of `Option`. `complete_options` turns what a caller passed to `reset` into a
-complete dictionary of plain Python values, or raises one `ValueError` that says which option is wrong and what would be
-right.
-"""
+"""Reset options: a table row each, by which `complete_options` checks what a caller passes, before anything changes."""
 
 import difflib
 import numbers

@@ -1,7 +1,4 @@
-"""What the three families share: an agent that walks, the sum of an episode's rewards, and a limit of steps.
-
-Shape letters: N lanes, n some of them.
-"""
+"""What the three families share: an agent that walks, the sum of an episode's rewards, and a limit of steps."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar

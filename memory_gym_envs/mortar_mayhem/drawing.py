@@ -1,7 +1,4 @@
-"""Drawing: floors, symbols and whole frames.
-
-Shape letters: F floors, n lanes.
-"""
+"""Drawing: floors, symbols and whole frames. Shape letters: F floors, n lanes."""
 
 from functools import cache
 

@@ -1,7 +1,4 @@
-"""The Mortar Mayhem environments. base.py and walking.py describe the methods that have no docstring here.
-
-Shape letters: N lanes, n some of them.
-"""
+"""The Mortar Mayhem environments. base.py and walking.py describe the methods that have no docstring here."""
 
 from typing import Any
 

@@ -1,7 +1,4 @@
-"""Rules: what a step does to the state. All functions change it in place, likewise `rewards` and `terminated`, (N,).
-
-Shape letters: N lanes, n some of them, L steps of the longest clue.
-"""
+"""Rules: what a step does to the state, and to `rewards` and `terminated`, (N,) each, which are changed in place."""
 
 import numpy as np
 

@@ -1,7 +1,4 @@
-"""The state of N lanes.
-
-Axes that grow: C commands, L steps of the longest clue.
-"""
+"""The state of N lanes. Axes that grow: C commands, L steps of the longest clue."""
 
 from dataclasses import dataclass
 

@@ -1,7 +1,4 @@
-"""Vector observations.
-
-Shape letters: F floors, N lanes, n some of them, V entries of a vector observation.
-"""
+"""Vector observations. Shape letters: F floors, N lanes, n some of them, V entries of a vector observation."""
 
 from functools import cache, lru_cache
 

@@ -1,7 +1,4 @@
-"""Mystery Path's frames: the ground, the trail behind the agent, the agent and its cross; and the debug view.
-
-Shape letters: N lanes, n some of them, T tiles of the trails, t those of some lanes.
-"""
+"""Mystery Path's frames and debug view. Shape letters: n lanes, T tiles of all trails, t those of the n lanes."""
 
 import math
 from functools import cache

@@ -1,7 +1,4 @@
-"""Mystery Path's vector observations: the state, as far as a frame shows it.
-
-Shape letters: n lanes, V entries of a vector, t tiles of the lanes' trails.
-"""
+"""Mystery Path's vector observations. Shape letters: n lanes, V entries of a vector, t tiles of the lanes' trails."""
 
 from functools import lru_cache
 from typing import Any, NamedTuple

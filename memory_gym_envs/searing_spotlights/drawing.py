@@ -1,7 +1,4 @@
-"""Frames, and the tables of pictures that they are made of.
-
-Shape letters: N lanes, n some of them, S spotlights that fit, R sprites, W a sprite's width, U uint64s.
-"""
+"""Frames and their tables. Shape letters: n lanes, S spotlights that fit, R sprites, W a sprite's width, U uint64s."""
 
 from functools import cache, lru_cache
 from typing import Any, NamedTuple

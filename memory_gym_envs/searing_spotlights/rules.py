@@ -1,7 +1,4 @@
-"""Rules: what the options mean for a lane, and what a step does to the state.
-
-It is changed in place, and so are `rewards` and `terminated`, (N,) each. Shape letters as in state.py.
-"""
+"""Rules: what a step does to the state, and to `rewards` and `terminated`, (N,) each, which are changed in place."""
 
 from typing import Any
 
