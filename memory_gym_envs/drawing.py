@@ -12,7 +12,6 @@ SCREEN = 84  # width and height of an observation in pixels
 ROW = 3 * SCREEN  # bytes in a row of a frame
 FRAME = SCREEN * ROW  # bytes in a frame
 FEW = 4  # sprites that are pasted faster one by one
-WHITE, RED, GREEN, BLUE = (255, 255, 255), (255, 0, 0), (0, 255, 0), (0, 0, 255)
 LUMA = np.array([77, 150, 29], np.float32) / 256  # ITU-R 601, in 256ths so that all sums are exact
 
 

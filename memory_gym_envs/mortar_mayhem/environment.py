@@ -8,7 +8,8 @@ import numpy as np
 from memory_gym_envs.appearance import VectorTables, vector_tables
 from memory_gym_envs.base import DEBUG_ZOOM
 from memory_gym_envs.character import FACINGS, PAD, Figure
-from memory_gym_envs.drawing import GREEN, ring
+from memory_gym_envs.colors import GREEN
+from memory_gym_envs.drawing import ring
 from memory_gym_envs.mortar_mayhem import drawing, levels, rules, vectors
 from memory_gym_envs.mortar_mayhem.arena import COMMANDS, FLOORS, TILE, TORUS_SIZE, first_pixel
 from memory_gym_envs.mortar_mayhem.options import VARIANTS, VECTOR_COMMANDS, MortarVariant

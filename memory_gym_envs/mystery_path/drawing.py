@@ -7,21 +7,8 @@ from typing import Any
 import numpy as np
 
 from memory_gym_envs.character import FACINGS, PAD, PIXELS, SPAN, radius_of
-from memory_gym_envs.drawing import (
-    BLUE,
-    FRAME,
-    GREEN,
-    RED,
-    ROW,
-    SCREEN,
-    WHITE,
-    Sheet,
-    make_sheet,
-    paste,
-    read_only,
-    stamp,
-    tile_picture,
-)
+from memory_gym_envs.colors import BLUE, GREEN, RED, WHITE
+from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, make_sheet, paste, read_only, stamp, tile_picture
 from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE
 from memory_gym_envs.mystery_path.state import FAST, NO_CELL, ROWS, State, tiles_of
 from memory_gym_envs.state import Lanes

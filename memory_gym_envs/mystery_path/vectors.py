@@ -7,7 +7,8 @@ import numpy as np
 
 from memory_gym_envs.appearance import CORNERS, AppearanceTables, VectorTables, View, tables_of
 from memory_gym_envs.character import FACINGS, LARGEST_RADIUS, PAD, PIXELS, SPAN, sprites
-from memory_gym_envs.drawing import RED, SCREEN, with_margin
+from memory_gym_envs.colors import RED
+from memory_gym_envs.drawing import SCREEN, with_margin
 from memory_gym_envs.mystery_path import drawing
 from memory_gym_envs.mystery_path.drawing import CROSS, STAMINA_BAR
 from memory_gym_envs.mystery_path.options import SIDE, TILE

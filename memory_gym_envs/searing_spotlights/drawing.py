@@ -8,21 +8,8 @@ import numpy as np
 from memory_gym_envs.base import NO_LIMIT
 from memory_gym_envs.bits import NO_SHAPE, Stencils, pixels, stencils
 from memory_gym_envs.character import FACINGS
-from memory_gym_envs.drawing import (
-    BLUE,
-    FRAME,
-    GREEN,
-    RED,
-    ROW,
-    SCREEN,
-    WHITE,
-    Sheet,
-    disk,
-    make_sheet,
-    paste,
-    read_only,
-    ring,
-)
+from memory_gym_envs.colors import BLUE, GREEN, RED, WHITE
+from memory_gym_envs.drawing import FRAME, ROW, SCREEN, Sheet, disk, make_sheet, paste, read_only, ring
 from memory_gym_envs.searing_spotlights.state import ABOVE_BAR, BELOW_BAR, COIN, EXIT, FADE, GONE, UNDER, State
 from memory_gym_envs.state import Lanes
 

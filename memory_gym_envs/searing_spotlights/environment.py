@@ -7,7 +7,8 @@ import numpy as np
 from memory_gym_envs.base import DEBUG_ZOOM
 from memory_gym_envs.bits import POSITION_0, POSITIONS, pixel_scratch
 from memory_gym_envs.character import PAD, Figure
-from memory_gym_envs.drawing import GREEN, SCREEN, magnify, ring
+from memory_gym_envs.colors import GREEN
+from memory_gym_envs.drawing import SCREEN, magnify, ring
 from memory_gym_envs.searing_spotlights import drawing, levels, rules, vectors
 from memory_gym_envs.searing_spotlights.drawing import TOP_BAR
 from memory_gym_envs.searing_spotlights.options import VARIANTS

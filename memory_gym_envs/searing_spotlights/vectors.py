@@ -12,7 +12,8 @@ import numpy as np
 from memory_gym_envs import bits
 from memory_gym_envs.bits import FULL_ROW, ITEMS, POSITION_0, POSITIONS, ROW_STEP, SUBSAMPLE_ROWS, Stencils
 from memory_gym_envs.character import FACINGS, sprites
-from memory_gym_envs.drawing import BLUE, GREEN, SCREEN, read_only
+from memory_gym_envs.colors import BLUE, GREEN
+from memory_gym_envs.drawing import SCREEN, read_only
 from memory_gym_envs.entries import vector_slices
 from memory_gym_envs.searing_spotlights import drawing
 from memory_gym_envs.searing_spotlights.drawing import ACTION_COLORS, BLUE_FLOOR, TOP_BAR, YELLOW
