@@ -59,18 +59,11 @@ def bars(endless: bool) -> np.ndarray:
     return read_only(table.reshape(-1, ROW))
 
 
-class SpotStencils(NamedTuple):
-    """Every spotlight at every position, by its radius."""
-
-    disks: Stencils
-    rims: Stencils  # their outlines
-
-
 @lru_cache(maxsize=8)
-def spot_stencils(least: int, largest: int) -> SpotStencils:
-    """The tables for spotlights of these radii. Cached: environments with the same options share them."""
+def spot_stencils(least: int, largest: int) -> tuple[Stencils, Stencils]:
+    """The tables of spotlights and of their outlines. Cached: environments with the same options share them."""
     disks, rims = spot_shapes(least, largest)
-    return SpotStencils(stencils(disks), stencils(rims))
+    return stencils(disks), stencils(rims)
 
 
 def spot_shapes(least: int, largest: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -174,7 +167,7 @@ def fading(duration: int, threshold: int) -> np.ndarray:
 class DrawingTables(NamedTuple):
     """The tables that frames are made of."""
 
-    spots: SpotStencils
+    spots: tuple[Stencils, Stencils]  # and their rims
     figures: Sheet
     coins_and_exits: Sheet
     bars: np.ndarray
@@ -250,10 +243,11 @@ def draw_layer(s: State, drawing: DrawingTables, lanes: Lanes, frames: np.ndarra
     draw_agents(s, drawing, lanes, frames, s.agent_layer[lanes] == layer)
 
 
-def light_masks(s: State, tables: SpotStencils, lanes: Lanes) -> tuple[np.ndarray, np.ndarray | None]:
+def light_masks(s: State, spots: tuple[Stencils, Stencils], lanes: Lanes) -> tuple[np.ndarray, np.ndarray | None]:
     """Masks of what the spotlights light and of their visible rims (None: no lane has rims), (n, 588) uint16 each."""
     key = s.spot_place[:, lanes, : int(s.num_spots.max())].transpose(0, 2, 1).copy()  # (2, S, n)
-    lit, rim = overlay(tables.disks.at(*key), tables.rims, key, s.rim[lanes])
+    disks, rims = spots
+    lit, rim = overlay(disks.at(*key), rims, key, s.rim[lanes])
     return lit.view(np.uint16), None if rim is None else rim.view(np.uint16)
 
 

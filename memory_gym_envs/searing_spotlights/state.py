@@ -44,9 +44,9 @@ class State(WalkingState):
     success: np.ndarray = array("N")  # 1 when the task is done
     # The spotlights, oldest first; rows are TIME .. BEND.
     spots: np.ndarray = array(len(NO_SPOT), "N", "S", dtype=np.float64, fill=NO_SPOT[:, None, None])
-    spot_key: np.ndarray = array("N", "S", fill=NO_KEY)  # where the radius begins in SpotStencils, plus POSITION_0
+    spot_key: np.ndarray = array("N", "S", fill=NO_KEY)  # where the radius begins in spot_stencils(), plus POSITION_0
     num_spots: np.ndarray = array("N")  # spotlights
-    spot_place: np.ndarray = array(2, "N", "S")  # where each shines: x and y as keys of SpotStencils; 0: nowhere
+    spot_place: np.ndarray = array(2, "N", "S")  # where each shines: x and y as keys of these; 0: nowhere
     near_light: np.ndarray = array("N", dtype=bool)  # some of the agent may be in the light
     spawn_wait: np.ndarray = array("N")  # steps until the next spotlight
     spawns_left: np.ndarray = array("N")  # spotlights to follow
