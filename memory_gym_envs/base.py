@@ -55,6 +55,10 @@ wrong options raise ValueError.
 `reset(options={...})` takes the same reset parameters, a single environment for one episode. `VARIANTS[id].options` and
 `docs/options.md` list them; of a list, one entry is sampled at every reset. The same page describes vectors.
 
+## Version History
+
+- v0: as in memory-gym 1.0.2, except for the differences above.
+
 ## References
 
 Marco Pleines: Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games. Dissertation, TU

@@ -74,10 +74,6 @@ class MortarMayhem(WalkingVectorEnv):
     others caught fire, which a failed last command does not raise, and in the finite ids `is_success`, whether that is
     all of them. In the finite ids, commands_completed and carried_out are shares of the sequence.
 
-    ## Version History
-
-    - v0: as in memory-gym 1.0.2, except for the differences below.
-
     ## Kept from the original
 
     - The command that ends the episode counts as uncompleted, even if it was checked and carried out before the agent

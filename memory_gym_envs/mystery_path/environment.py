@@ -65,11 +65,6 @@ class MysteryPath(WalkingVectorEnv):
     `success` and `is_success`; in the endless id, instead of these two, `tiles_visited` and `max_x`, the rightmost
     column of the path that the agent reached.
 
-    ## Version History
-
-    - v0: as in memory-gym 1.0.2, except for what is said below. In 1.0.3, the origin of the endless path does not
-      restore stamina: `origin_restores_stamina=False`.
-
     ## Kept from the original
 
     - The agent starts its radius away from the left and upper edge of its tile, so one of scale 0.48 or more starts
@@ -77,6 +72,7 @@ class MysteryPath(WalkingVectorEnv):
     - The Grid id ignores `agent_scale`, the endless id `show_origin`.
     - Steps are cut off to whole pixels, a diagonal one to 2 pixels at the default speed. In the endless id the camera's
       fraction of a pixel is cut off, and the background jumps at speeds that do not divide 12.
+    - In the endless id the origin restores stamina, other than in 1.0.3: `origin_restores_stamina=False`.
     - In the endless id the tiles where the agent fell off count until the episode ends. Where the path goes left, the
       agent cannot follow it.
     - Of the path's leftmost column that is shown behind the agent, only one tile is drawn, and nothing is drawn while

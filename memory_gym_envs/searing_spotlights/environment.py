@@ -66,10 +66,6 @@ class SearingSpotlights(WalkingVectorEnv):
 
     Radii and speeds of spotlights are sampled between their smallest and largest, `spawn_delay` for each interval.
 
-    ## Version History
-
-    - v0: as in memory-gym 1.0.2, except for the differences below.
-
     ## Kept from the original
 
     - The bar shows the action and the reward of the step before the last.
