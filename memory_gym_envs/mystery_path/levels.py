@@ -185,9 +185,13 @@ def write_level(s: State, lane: int, level: Level, endless: bool) -> None:
 
 def write_path(s: State, lane: int, level: Level, endless: bool) -> None:
     """Appends to the lane's path, for which the state may have to grow."""
-    first, segments = int(s.path_length[lane]) + 1, int(s.segments[lane])
-    last = first + len(level.path)
-    make_path_room(s, last, segments + len(level.walls))
+    first, before = int(s.path_length[lane]) + 1, int(s.segments[lane])
+    last, segments = first + len(level.path), before + len(level.walls)
+    room = s.fell_at.shape[1] // (SEGMENT * ROWS)  # for segments
+    if last > s.path_cell.shape[1] or segments > room:
+        # At least by half, so that a path that grows for long seldom has to be copied.
+        make_room(s, "P", max(last, s.path_cell.shape[1] * 3 // 2))
+        make_room(s, "M", max(segments, room * 3 // 2) * SEGMENT * ROWS)
     s.path_cell[lane, first:last] = level.path
     path = s.path_cell[lane, first:last]
     s.step_at[lane][path] = np.arange(first, last)
@@ -195,18 +199,9 @@ def write_path(s: State, lane: int, level: Level, endless: bool) -> None:
     # After a transition tile the path goes on to the right. At the goal, the direction is the one that leads to it.
     s.direction_at[lane, last - 1] = EAST if endless else s.direction_at[lane, last - 2]
     s.path_length[lane] = last - 1
-    for segment, walls in enumerate(level.walls, segments):
+    for segment, walls in enumerate(level.walls, before):
         s.walls[lane, cells_of(walls, segment)] = True
-    s.segments[lane] += len(level.walls)
-
-
-def make_path_room(s: State, steps: int, segments: int) -> None:
-    """Widens the state if it cannot hold so many steps, PIT included, and segments."""
-    room = s.fell_at.shape[1] // (SEGMENT * ROWS)
-    if steps > s.path_cell.shape[1] or segments > room:
-        # At least by half, so that a path that grows for long seldom has to be copied.
-        make_room(s, "P", max(steps, s.path_cell.shape[1] * 3 // 2))
-        make_room(s, "M", max(segments, room * 3 // 2) * SEGMENT * ROWS)
+    s.segments[lane] = segments
 
 
 def append_segment(s: State, lane: int, rng: np.random.Generator) -> None:
