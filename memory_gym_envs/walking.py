@@ -37,8 +37,8 @@ class WalkingVectorEnv(MemoryGymVectorEnv):
     # ---- what a family provides ----
 
     def figures_of(self, values: dict[str, Any]) -> tuple[Figure, ...]:
-        """The agent's figure under these options, or two: as it walks along x and along y."""
-        raise NotImplementedError
+        """The agent's figure under these options, here on the whole screen; or two, as it walks along x and along y."""
+        return (self.figure_of(values, 0, SCREEN),)
 
     def vector_tables(self) -> Any:
         """The tables of vector observations."""

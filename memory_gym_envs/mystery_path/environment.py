@@ -1,14 +1,13 @@
 """The Mystery Path environments. base.py and walking.py describe the methods that have no docstring here."""
 
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from memory_gym_envs.appearance import VectorTables, vector_tables
 from memory_gym_envs.base import DEBUG_ZOOM
-from memory_gym_envs.character import FACINGS, PAD, Figure, radius_of
-from memory_gym_envs.drawing import SCREEN, magnify
+from memory_gym_envs.character import FACINGS, PAD, radius_of
+from memory_gym_envs.drawing import magnify
 from memory_gym_envs.mystery_path import drawing, levels, rules, vectors
 from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE, VARIANTS
 from memory_gym_envs.mystery_path.state import MAP_STRIDES, NO_CELL, PIT, PIT_ROWS, ROWS, State, tiles_of
@@ -98,9 +97,6 @@ class MysteryPath(WalkingVectorEnv):
         s.extras[lanes] = (s.show_origin | s.show_goal | s.show_ground | s.show_stamina)[lanes]
         if self.variant.endless:
             drawing.set_camera(s, lanes, values)
-
-    def figures_of(self, values: dict[str, Any]) -> tuple[Figure, ...]:
-        return (self.figure_of(values, 0, SCREEN),)
 
     def place_tables(self) -> None:
         endless = self.variant.endless
