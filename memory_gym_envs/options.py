@@ -36,17 +36,10 @@ class Option:
         """The allowed values as text."""
         if self.kind == "bool":
             return "true or false"
-        noun = {
-            "int": "an integer",
-            "float": "a number",
-            "ints": f"a list of {self._shortest} to {LONGEST_LIST} integers",
-        }
+        least = 0 if self.empty else 1
+        noun = {"int": "an integer", "float": "a number", "ints": f"a list of {least} to {LONGEST_LIST} integers"}
         text = "{} from {} to {}".format(noun[self.kind], *self.bounds)
         return " or ".join([*(str(value) for value in self.also), text])
-
-    @property
-    def _shortest(self) -> int:
-        return 0 if self.empty else 1
 
     def parse(self, value: Any) -> Any:
         """The value as bool, int, float or tuple of int; None if it is not allowed. Whole floats are integers, too."""
@@ -54,7 +47,7 @@ class Option:
             return bool(value) if isinstance(value, (bool, np.bool_)) else None
         if self.kind == "ints":
             listed = isinstance(value, (list, tuple, range)) or (isinstance(value, np.ndarray) and value.ndim == 1)
-            if not listed or not self._shortest <= len(value) <= LONGEST_LIST:
+            if not listed or len(value) > LONGEST_LIST or not (len(value) or self.empty):
                 return None
             numbers_ = tuple(self._number(item, int) for item in value)
             return None if None in numbers_ else numbers_
