@@ -92,10 +92,6 @@ class MemoryGymEnv(gym.Env):
         pictures = self.batch.render()
         return None if pictures is None else pictures[0]
 
-    def close(self) -> None:
-        """Releases nothing: no environment holds a window or shares anything with another."""
-        self.batch.close()
-
     # What else the original's environments have.
 
     @property
