@@ -18,8 +18,6 @@ from memory_gym_envs.state import Lanes, empty, make_room
 from memory_gym_envs.walking import WalkingVectorEnv
 from memory_gym_envs.words import sample_below, word_source
 
-EVERY_LANE: Any = np.True_  # a mask for when no clue is shown, so that all lanes act
-
 
 class MortarMayhem(WalkingVectorEnv):
     """Mortar Mayhem (thesis 4.3): memorise a sequence of commands, then carry them out in time.
@@ -143,20 +141,20 @@ class MortarMayhem(WalkingVectorEnv):
         """Shows clues, moves the agents and changes the tiles: rewards and terminations, (N,) each."""
         s = self.state
         rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, bool)
-        acting, count = EVERY_LANE, self.num_envs
+        acting: Any = np.True_  # all lanes, unless a clue is shown
         if self._clues_open:
             acting = rules.show_clue(s, self._lane_clue)  # (N,) bool
-            count = int(np.count_nonzero(acting))
-            self._clues_open = count < self.num_envs
-        if count:
-            if acting is not EVERY_LANE:
-                action = np.where(acting, action, self._controls.actions - 1)
-            self.move_agents(action)
-            s.timer -= acting
-            due = s.timer == 0  # only a lane that acts gets there
-            if np.count_nonzero(due):
-                self._change_tiles(due.nonzero()[0], rewards, terminated)
-            rules.burn_agents(s, acting, rewards, terminated)
+            count = np.count_nonzero(acting)
+            self._clues_open = bool(count < self.num_envs)
+            if not count:
+                return rewards, terminated
+            action = np.where(acting, action, self._controls.actions - 1)
+        self.move_agents(action)
+        s.timer -= acting
+        due = s.timer == 0  # only a lane that acts gets there
+        if np.count_nonzero(due):
+            self._change_tiles(due.nonzero()[0], rewards, terminated)
+        rules.burn_agents(s, acting, rewards, terminated)
         return rewards, terminated
 
     def _change_tiles(self, lanes: np.ndarray, rewards: np.ndarray, terminated: np.ndarray) -> None:
