@@ -1,6 +1,5 @@
 """The Mystery Path environments. base.py and walking.py describe the methods that have no docstring here."""
 
-
 import gymnasium as gym
 import numpy as np
 
@@ -117,8 +116,7 @@ class MysteryPath(WalkingVectorEnv):
     def begin(self, lanes: np.ndarray) -> None:
         rules.forget_trails(self.state, lanes)
         for lane in lanes.tolist():
-            level = levels.sample_level(self._rngs[lane], self.settings[lane], self.variant)
-            levels.write_level(self.state, lane, level, self.variant.endless)
+            levels.start_episode(self.state, lane, self._rngs[lane], self.settings[lane], self.variant.endless)
         self._index_lanes()
 
     def apply_rules(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

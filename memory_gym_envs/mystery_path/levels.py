@@ -13,7 +13,6 @@ from memory_gym_envs.character import PAD
 from memory_gym_envs.mystery_path.options import SEGMENT, SIDE, TILE
 from memory_gym_envs.mystery_path.state import DIRECTIONS, EAST, NO_STEP, ORIGIN, PIT, PIT_ROWS, ROWS, UNREWARDED, State
 from memory_gym_envs.state import make_room
-from memory_gym_envs.variant import Variant
 from memory_gym_envs.words import WordBuffer, pick, sample_below
 
 FIRST_SEGMENTS = 3  # of an endless path; another is appended whenever the agent enters the last one
@@ -70,10 +69,10 @@ def read_ahead(rng: np.random.Generator, paths: int) -> WordBuffer:
     return WordBuffer(rng, paths * (DRAWS + SPARE_DRAWS))
 
 
-def sample_level(rng: np.random.Generator, values: dict[str, Any], variant: Variant) -> Level:
+def sample_level(rng: np.random.Generator, values: dict[str, Any], endless: bool) -> Level:
     """Samples a level. It draws in the original's order, so that a seed builds the same level."""
-    buffer = read_ahead(rng, FIRST_SEGMENTS if variant.endless else 1)
-    if variant.endless:
+    buffer = read_ahead(rng, FIRST_SEGMENTS if endless else 1)
+    if endless:
         level = sample_segments(buffer, sample_below(buffer, SIDE), 0, FIRST_SEGMENTS)
     else:
         side = pick(buffer, values["cardinal_origin_choice"])
@@ -160,8 +159,9 @@ def cells_of(nodes: list[int], segment: int) -> list[int]:
     return [CELLS[node] + shift for node in nodes]
 
 
-def write_level(s: State, lane: int, level: Level, endless: bool) -> None:
-    """Starts the lane's episode at this level, for which the state may have to grow."""
+def start_episode(s: State, lane: int, rng: np.random.Generator, values: dict[str, Any], endless: bool) -> None:
+    """Starts the lane's next episode, with these reset options."""
+    level = sample_level(rng, values, endless)
     s.step_at[lane] = PIT
     s.fell_at[lane] = s.walls[lane] = s.fallen[lane] = s.shows_cross[lane] = False
     s.path_length[lane] = s.segments[lane] = s.max_column[lane] = s.fails[lane] = s.visited[lane] = 0
