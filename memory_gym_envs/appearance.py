@@ -2,8 +2,7 @@
 
 The screen's edge, a symbol or a cross may hide so much of an agent that several positions and facings look the same.
 The tables made here say which, so that a vector observation knows no more than who sees the frame.
-Shape letters: R sprites (the facings of all views), W a sprite's width, P stored positions along one axis, N lanes, n
-some of them, V entries of a vector.
+Shape letters: R sprites (the facings of all views), W a sprite's width, P stored positions along one axis.
 """
 
 from typing import NamedTuple

@@ -22,6 +22,8 @@ BLUE_FLOOR, RED_FLOOR, WHITE_FLOOR, BLACK_FLOOR = range(4)
 WIDTHS = SCREEN + 1  # of lost health in the top bar: the last hit may take more than the half that shows health
 BARS_PER_CHOICE = 3 * 3 * 3 * WIDTHS  # rows of bars() for one choice of what to show
 
+Scales = tuple[tuple[float, float], ...]  # of a coin and an exit, a pair for every three sprites
+
 
 # ---- pictures ----
 
@@ -74,7 +76,7 @@ def spot_shapes(least: int, largest: int) -> tuple[list[np.ndarray], list[np.nda
     return [NO_SHAPE] * least + disks, [NO_SHAPE] * least + rims
 
 
-def draw_coins_and_exits(scales: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.ndarray]:
+def draw_coins_and_exits(scales: Scales) -> tuple[np.ndarray, np.ndarray]:
     """A coin, a closed exit and an open one for each pair of scales: sprites (R, W, W, 3) uint8 and masks (R, W, W)."""
     width = 2 * max(int(10 * scale) for pair in scales for scale in pair) + 2
     images = np.zeros((3 * len(scales), width, width, 3), np.uint8)
@@ -87,7 +89,7 @@ def draw_coins_and_exits(scales: tuple[tuple[float, float], ...]) -> tuple[np.nd
 
 
 @lru_cache(maxsize=16)
-def coin_and_exit_sheet(scales: tuple[tuple[float, float], ...]) -> Sheet:
+def coin_and_exit_sheet(scales: Scales) -> Sheet:
     """The sprites of draw_coins_and_exits(). Cached: environments with the same options share them."""
     return make_sheet(*draw_coins_and_exits(scales), np.arange(SCREEN))
 

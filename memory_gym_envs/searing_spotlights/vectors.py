@@ -16,7 +16,7 @@ from memory_gym_envs.colors import BLUE, GREEN
 from memory_gym_envs.drawing import SCREEN, read_only
 from memory_gym_envs.entries import vector_slices
 from memory_gym_envs.searing_spotlights import drawing
-from memory_gym_envs.searing_spotlights.drawing import ACTION_COLORS, BLUE_FLOOR, TOP_BAR, YELLOW
+from memory_gym_envs.searing_spotlights.drawing import ACTION_COLORS, BLUE_FLOOR, TOP_BAR, YELLOW, Scales
 from memory_gym_envs.searing_spotlights.state import ABOVE_BAR, AGENT, BELOW_BAR, COIN, EXIT, FADE, UNDER, State
 from memory_gym_envs.state import Lanes
 from memory_gym_envs.variant import Variant
@@ -72,16 +72,12 @@ class VectorTables(NamedTuple):
 
 
 def make_vector_tables(
-    s: State,
-    variant: Variant,
-    radii: tuple[int, int],
-    figure_scales: tuple[float, ...],
-    scales: tuple[tuple[float, float], ...],
+    s: State, variant: Variant, radii: tuple[int, int], figure_scales: tuple[float, ...], scales: Scales
 ) -> VectorTables:
     """The tables for the lanes of this state.
 
     radii: the smallest and the largest spotlight. figure_scales: of each two figures, which State.figure numbers.
-    scales: of coin and exit, for each three sprites, which State.coin_sprite numbers.
+    scales: those that State.coin_sprite numbers.
     """
     first, coins = radii[1] + 1, s.bodies.shape[2] - COIN
     agent = first + s.figure // 2 * FACINGS  # (N,) each
@@ -111,7 +107,7 @@ def make_vector_tables(
 
 @lru_cache(maxsize=16)
 def vector_shapes(
-    least: int, largest: int, figure_scales: tuple[float, ...], scales: tuple[tuple[float, float], ...]
+    least: int, largest: int, figure_scales: tuple[float, ...], scales: Scales
 ) -> tuple[Stencils, Stencils, Stencils]:
     """VectorTables' shapes, rims and high. Cached: environments with equal options share them."""
     disks, rims = drawing.spot_shapes(least, largest)
