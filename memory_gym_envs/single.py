@@ -177,7 +177,7 @@ class SearingSpotlightsEnv(MemoryGymEnv):  # noqa: D101
 
 
 def register(environment: type[MemoryGymEnv], namespace: str | None = None) -> None:
-    """Registers the family's ids, as `namespace/id` if there is one, for `gym.make` and `gym.make_vec`."""
+    """Registers the family's ids for `gym.make` and `gym.make_vec`, with a namespace as `namespace/id`."""
     one, many = (f"{made.__module__}:{made.__name__}" for made in (environment, environment.family))
     for variant in environment.family.variants:
         name = f"{namespace}/{variant}" if namespace else variant

@@ -57,7 +57,7 @@ def start_episode(
 
 
 def sample_walk(next_word: Callable[[], int], tile: int, count: int, size: int, kinds: int) -> list[int]:
-    """So many of the first `kinds` COMMANDS, which lead from the tile (column * size + row) and stay in the arena."""
+    """So many of the first `kinds` of command that lead from the tile, column * size + row, and stay in the arena."""
     moves = moves_inside(size, kinds)
     commands = []
     for _ in range(count):

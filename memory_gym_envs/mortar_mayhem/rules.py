@@ -39,7 +39,7 @@ def on_target(s: State, lanes: Lanes) -> np.ndarray:
 
 
 def ignite_tiles(s: State, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sets all tiles but the target on fire, which checks the command: rewards (n,), whose sequence is over (n,)."""
+    """Sets all tiles but the target on fire and checks the command: rewards, and whose sequence is over, (n,) each."""
     s.current[lanes] += 1
     s.burning[lanes] = True
     s.timer[lanes] = s.explosion_duration[lanes]

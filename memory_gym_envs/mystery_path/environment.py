@@ -70,7 +70,7 @@ class MysteryPath(WalkingVectorEnv):
     - The Grid id ignores `agent_scale`, the endless id `show_origin`.
     - Steps are cut off to whole pixels, a diagonal one to 2 pixels at the default speed. In the endless id the camera's
       fraction of a pixel is cut off, and the background jumps at speeds that do not divide 12.
-    - In the endless id the origin restores stamina, other than in 1.0.3: `origin_restores_stamina=False`.
+    - In the endless id the origin restores stamina. In 1.0.3 it does not, as with `origin_restores_stamina=False`.
     - In the endless id the tiles where the agent fell off count until the episode ends. Where the path goes left, the
       agent cannot follow it.
     - Of the path's leftmost column that is shown behind the agent, only one tile is drawn, and nothing is drawn while

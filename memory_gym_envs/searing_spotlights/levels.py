@@ -53,7 +53,7 @@ def start_episode(s: State, lane: int, rng: np.random.Generator, values: dict[st
             position, free = sample_position(next_word, free, COIN_SPACE)
             coins.append(inside(position))
         if values["use_exit"]:
-            s.bodies[:, lane, EXIT] = s.targets[lane, 2:] = coins.pop()
+            s.bodies[:, lane, EXIT] = s.targets[lane, 2:] = coins.pop()  # the last of them
     for coin, position in enumerate(coins):
         s.bodies[:, lane, COIN + coin] = position
     s.num_coins[lane] = s.coins_left[lane] = len(coins)

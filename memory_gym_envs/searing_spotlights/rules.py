@@ -126,7 +126,7 @@ def burn(s: State, lanes: np.ndarray, rewards: np.ndarray, terminated: np.ndarra
     rewards[lanes] = s.reward_inside[lanes] + s.reward_death[lanes] * dead
 
 
-# ---- coins and exit ----
+# ---- coins, exit and the end of a step ----
 
 
 def touched_bodies(s: State) -> np.ndarray:
