@@ -1,7 +1,6 @@
 """Does memory matter, and which one? Trains agents on a suite of tasks, and tabulates what they reach.
 
-    python benchmarks/learning.py --out docs/learning.png
-    python benchmarks/learning.py --tasks endless-mortar-mayhem --agents GRU TrXL "TrXL, gradient" --steps 6e6
+    python benchmarks/learning.py --tasks endless-mortar-mayhem --agents GRU TrXL TrXL+ --steps 6e6
     python benchmarks/learning.py --suite full --results benchmarks/results
     python benchmarks/learning.py --results benchmarks/results --csv results.csv
 
@@ -165,7 +164,7 @@ def plan(config: Training, task: Task, agent: str, seed: int) -> Plan:
     }
     name, dashes, further = agent.partition(" --")
     script, *memory = AGENTS.get(name, name).split()
-    own = task.trxl_flags if "trxl" in script else task.gru_flags
+    own = "" if "trxl" in script else task.gru_flags
     flags = [*COMMON.split(), *memory, *own.split()]
     flags += ["--anneal-steps", str(steps)]
     for each, value in of_the_suite.items():

@@ -15,19 +15,14 @@ PRESET = {  # --preset laptop
     "GRU": "ppo_gru.py",
     "LSTM": "ppo_gru.py --memory lstm",
     "TrXL": "ppo_trxl.py --no-trxl-query-position --no-trxl-memory-gradient",  # the thesis', where the preset differs
-    "GTrXL": "ppo_trxl.py --no-trxl-query-position --no-trxl-memory-gradient --trxl-gate gru",
     "TrXL+": "ppo_trxl.py",
+    "GTrXL+": "ppo_trxl.py --trxl-gate gru",
 }
-# What it was until Muon.
-ADAMW = "--value-init-gain 1 --no-attend-commands --optimizer adamw --no-norm-reward --num-envs 32 --update-epochs 4"
-ADAMW += " --num-minibatches 8 --init-lr 1e-3 --final-lr 1e-4 --init-ent-coef 5e-4 --final-ent-coef 5e-5"
-ADAMW_TRXL = f"{ADAMW} --gamma 0.99 --vf-coef 0.5 --trxl-num-layers 2 --trxl-dim 64 --trxl-memory-length 128"
 # What suits ppo_gru.py in Mystery Path, as far as it learns there: smaller steps, a longer horizon, raw rewards.
 LOW_RATE = "--init-lr 3e-4 --gamma 0.995 --clip-coef 0.1 --no-norm-reward"
 LOW_RATE += " --exploration-bonus entropy --init-ent-coef 1e-4 --final-ent-coef 1e-5"
 AGENTS = {
     **PRESET,
-    **{f"{name}, AdamW": f"{flags} {ADAMW_TRXL if 'trxl' in flags else ADAMW}" for name, flags in PRESET.items()},
     # What the preset was for the transformer until 2026-11.
     "TrXL+, before": "ppo_trxl.py --init-lr 1e-3 --gamma 0.99 --vf-coef 0.5 --value-init-gain 1",
     "TrXL+, low rate": f"ppo_trxl.py --vf-coef 0.5 --value-init-gain 1 {LOW_RATE}",
@@ -42,7 +37,6 @@ class Task:
     total_timesteps: int
     options: dict = field(default_factory=dict)
     gru_flags: str = ""  # of the agents of ppo_gru.py
-    trxl_flags: str = ""  # of those of ppo_trxl.py
 
     @property
     def title(self) -> str:
@@ -72,15 +66,6 @@ SMALL = {
             "explosion_delay": [4],
             "explosion_duration": [2],
         },
-    ),
-    "mystery-path": Task(
-        "MysteryPath-Grid-v0",
-        1_500_000,
-        # All paths begin at the left, and each of their tiles pays a tenth of the goal's reward when first reached:
-        # without this, chance finds too few goals.
-        {"cardinal_origin_choice": [0], "reward_path_progress": 0.1},
-        # Where the agent fell matters, not when.
-        trxl_flags="--trxl-positional-encoding none",
     ),
     "endless-mortar-mayhem": Task(
         "Endless-MortarMayhem-v0",
@@ -113,9 +98,8 @@ FULL = {  # until an agent comes to rest, or as far as is affordable
     )
 }
 TASKS = SMALL | FULL
-IN_SMALL = ("no memory", "4 frames", "16 frames", "GRU", "TrXL", "TrXL+")
 SUITES = {  # tasks and agents
-    "small": (SMALL, tuple(f"{name}, AdamW" for name in IN_SMALL)),
+    "small": (SMALL, ("no memory", "4 frames", "16 frames", "GRU", "TrXL", "TrXL+")),
     "full": (FULL, ("no memory", "16 frames", "GRU", "TrXL+")),
 }
 COLORS = {  # an agent has the same in every picture
@@ -126,10 +110,9 @@ COLORS = {  # an agent has the same in every picture
     "GRU": "tab:blue",
     "LSTM": "tab:cyan",
     "TrXL": "tab:orange",
-    "GTrXL": "tab:purple",
+    "GTrXL+": "tab:purple",
     "TrXL+": "tab:red",
 }
-COLORS |= {f"{name}, AdamW": color for name, color in COLORS.items()}
 COLORS |= {f"TrXL+, {settings}": "tab:green" for settings in ("before", "low rate")}
 
 

@@ -271,7 +271,7 @@ def aggregate(tasks: dict[str, Runs], bounds: dict[str, Bounds]) -> str:
         low, high = np.percentile(values, [2.5, 97.5])
         return f"{float(value):.2f} ({low:.2f} to {high:.2f})"
 
-    rivals = [name for rival in RIVALS for name in names if name.removesuffix(", AdamW") == rival]
+    rivals = [rival for rival in RIVALS if rival in names]
     header = ["agent", "normalized IQM", *(f"better than {rival}" for rival in rivals)]
     lines = [f"| {' | '.join(header)} |", f"|---|{'---:|' * (len(header) - 1)}"]
     for name, scores, resamples in zip(names, normalized, resampled, strict=True):

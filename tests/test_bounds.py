@@ -26,5 +26,5 @@ def test_the_file(tmp_path):
     bounds.main(tmp_path / "bounds.csv", levels=2, max_steps=5)
     head, *rows = (tmp_path / "bounds.csv").read_text().splitlines()
     assert head == "task,score,random,scripted"
-    assert len(rows) == 12
+    assert len(rows) == 11
     assert "MysteryPath-Grid-v0,success,0,0" in rows
