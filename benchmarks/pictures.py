@@ -1,33 +1,76 @@
-"""Draw the pictures of the environments: the agent's view above, the debug view below, a column for each moment.
+"""Draw an episode of a trained agent: what it would see as an image, and the debug view, which shows all.
 
-python benchmarks/pictures.py docs
+    python benchmarks/pictures.py agents/mortar-mayhem-grid-trxl.pt docs/agent.gif
+    python benchmarks/pictures.py agents/mystery-path-grid-trxl.pt docs/mystery_path.png
+
+A GIF has a frame for each step and, in Mortar Mayhem, a strip with all commands of the episode: a frame around the one
+that is due, a green tick in those that were carried out. A PNG has six steps at even distances. The level is one of the
+test levels, with the agent's own environment and options.
 """
 
+import functools
+import json
 import sys
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+import torch
+import tyro
 from PIL import Image, ImageDraw, ImageFont
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
 import memory_gym_envs  # noqa: F401 (registers the ids)
+from learning import FIRST_TEST_LEVEL
+from memory_gym_envs.mortar_mayhem.drawing import SYMBOL, symbols
+from ppo_utils.acting import Player
 
-RED, YELLOW = (255, 0, 0), (255, 255, 0)
-VIEW, GAP, LABEL = 336, 8, 44  # pixels: a view's side, white between views, the margins with labels on top and left
+VIEW, GAP, LABEL = 336, 8, 44  # pixels: a view's side, white between views, margins with labels
+MILLISECONDS = 160  # that a frame is shown
+LAST = 12  # times as long is the last one
+COLUMNS = 6  # of a PNG
+GREEN, ORANGE, GRAY = (0, 140, 0), (240, 120, 0), (200, 200, 200)
+
+
+@dataclass
+class Config:
+    """Draw an episode of a trained agent."""
+
+    checkpoint: tyro.conf.Positional[Path]
+    """a file that --save-model wrote"""
+    out: tyro.conf.Positional[Path]
+    """the file to write, a GIF or a PNG"""
+    level: int = FIRST_TEST_LEVEL
+    """the level to play"""
 
 
 class Moment(NamedTuple):
-    """An episode after so many steps."""
+    """An episode after some steps."""
 
-    step: int
-    observation: np.ndarray  # (84, 84, 3)
-    truth: np.ndarray  # the id's ground truth
-    returned: float  # sum of rewards so far
-    picture: np.ndarray  # the agent's view above the debug view, both VIEW pixels wide
+    truth: dict[str, Any]  # what `oracle()` tells
+    views: list[np.ndarray]  # the agent's and the debug view, (VIEW, VIEW, 3)
+
+
+def play(path: Path, level: int) -> tuple[list[Moment], dict[str, Any]]:
+    """Return all moments of an episode, and its last info."""
+    torch.manual_seed(1)
+    player = Player(path)
+    make = functools.partial(gym.make, player.args.env_id, obs_type=player.args.obs_type)
+    envs = make(render_mode="rgb_array"), make(render_mode="debug_rgb_array")
+    options = json.loads(player.args.env_options)
+    (observation, _), _ = (env.reset(seed=level, options=options) for env in envs)
+    moments, done, info, reward = [], False, {}, 0.0
+    while True:
+        views = [Image.fromarray(env.render()).resize((VIEW, VIEW), Image.Resampling.NEAREST) for env in envs]
+        moments.append(Moment(envs[0].unwrapped.oracle(), [np.asarray(view) for view in views]))
+        if done:
+            return moments, info
+        action = player.act(observation, reward)
+        (observation, reward, terminated, truncated, info), _ = (env.step(action) for env in envs)
+        done = terminated or truncated
 
 
 def joined(pictures: list[np.ndarray], axis: int) -> np.ndarray:
@@ -38,112 +81,63 @@ def joined(pictures: list[np.ndarray], axis: int) -> np.ndarray:
     return np.concatenate([part for picture in pictures for part in (white, picture)][1:], axis)
 
 
-def episode(env_id: str, seed: int, act: Callable[[Moment], np.ndarray], steps: int = 1000, **options) -> list[Moment]:
-    """Play an episode, or as many steps of it, and return all its moments."""
-    env = gym.make(env_id, render_mode="debug_rgb_array")
-    observation, info = env.reset(seed=seed, options=options)
-    moments, returned, done = [], 0.0, False
-    while True:
-        picture = joined([observation.repeat(4, axis=0).repeat(4, axis=1), env.render()], axis=0)
-        moments.append(Moment(len(moments), observation, info["ground_truth"], returned, picture))
-        if done or len(moments) > steps:
-            return moments
-        observation, reward, terminated, truncated, info = env.step(act(moments[-1]))
-        returned, done = returned + reward, terminated or truncated
-
-
-def first(moments: list[Moment], condition: Callable[[Moment], bool]) -> Moment:
-    """Return the first moment for which the condition holds."""
-    return next(moment for moment in moments if condition(moment))
-
-
-def shows(color: tuple[int, int, int], rows: slice = slice(4, None)) -> Callable[[Moment], bool]:
-    """Return the condition that the agent sees the color in these rows: by default below a top bar."""
-    return lambda moment: bool((moment.observation[rows] == color).all(axis=-1).any())
-
-
-def towards(away: np.ndarray) -> np.ndarray:
-    """Return the action of free movement that goes there, for a distance in pixels along x and y."""
-    return np.where(np.abs(away) <= 2, 0, np.where(away > 0, 2, 1))
-
-
-def mortar_mayhem() -> dict[str, Moment]:
-    """Return four moments by what happens in them."""
-
-    def act(moment: Moment) -> np.ndarray:
-        agent = np.argwhere((moment.observation == (250, 204, 153)).all(-1)).mean(0)[::-1]
-        target = (moment.truth * 4 * 14 + 14).astype(int)  # of an arena of five
-        # After the first command it stays where it is, and so fails the second.
-        return np.zeros(2, int) if moment.returned else towards(target - agent)
-
-    moments = episode("MortarMayhem-v0", 3, act, command_count=[2])
-    return {
-        "a command is shown": moments[0],
-        "walking to its tile": moments[10],
-        "correct tile: reward 0.1": first(moments, lambda moment: moment.returned > 0),
-        "wrong tile: episode ends": moments[-1],
-    }
-
-
-def mystery_path() -> dict[str, Moment]:
-    """Return four moments by what happens in them, the last of the endless task."""
-    ways = np.array([(2, 0), (0, 1), (0, 2), (1, 0)])  # east, north, south, west
-
-    def act(moment: Moment) -> np.ndarray:
-        way = moment.truth.argmax()
-        return ways[way if moment.step < 24 else way ^ 1]  # later to the side, south instead of west
-
-    moments = episode("MysteryPath-v0", 5, act)
-    endless = episode("Endless-MysteryPath-v0", 3, lambda moment: 1 + moment.truth.argmax(), 60)
-    return {
-        "start at the origin": moments[0],
-        "on the path": moments[24],
-        "fell off: red cross": first(moments, shows(RED)),
-        "endless: past path visible": endless[-1],
-    }
-
-
-def searing_spotlights() -> dict[str, Moment]:
-    """Return four moments by what happens in them, the last of the endless task."""
-
-    def act(moment: Moment) -> np.ndarray:
-        agent, *things = moment.truth.reshape(-1, 2) * 84
-        return towards(next(thing for thing in things if thing.any()) - agent)
-
-    moments = episode("SearingSpotlights-v0", 41, act)
-    endless = episode("Endless-SearingSpotlights-v0", 8, act, 52)
-    return {
-        "the light goes out": moments[3],
-        "dark: coin collected": first(moments, shows(YELLOW, slice(1))),
-        "in the light: health lost": first(moments, shows(RED)),
-        "endless: a new coin": endless[-1],
-    }
-
-
-def text(words: str, width: int) -> Image.Image:
+def text(words: str, width: int = VIEW) -> Image.Image:
     """Return words in the middle of a white strip, (LABEL, width)."""
     strip = Image.new("RGB", (width, LABEL), "white")
     ImageDraw.Draw(strip).text((width / 2, LABEL / 2), words, "black", ImageFont.load_default(28), anchor="mm")
     return strip
 
 
-def labelled(moments: dict[str, Moment]) -> Image.Image:
-    """Return the moments beside each other, with what happens above them and the names of the views on the left."""
-    pictures = joined([moment.picture for moment in moments.values()], axis=1)
-    whole = Image.new("RGB", (LABEL + pictures.shape[1], LABEL + pictures.shape[0]), "white")
-    whole.paste(Image.fromarray(pictures), (LABEL, LABEL))
-    for column, words in enumerate(moments):
-        whole.paste(text(words, VIEW), (LABEL + column * (VIEW + GAP), 0))
+def strip(step: int, truth: dict[str, Any], width: int) -> Image.Image:
+    """Return a strip of that width with the episode's step and, in Mortar Mayhem, its commands and how far they are."""
+    if "commands" not in truth:
+        return text(f"step {step}", width)
+    picture = Image.new("RGB", (width, LABEL), "white")
+    words, side, between = 120, LABEL - 4, 55  # pixels: for the step, of a command's box, from one box to the next
+    picture.paste(text(f"step {step}", words))
+    draw = ImageDraw.Draw(picture)
+    for index, command in enumerate(command for command in truth["commands"] if command >= 0):
+        x, y = words + between * index, 2
+        symbol = 255 - symbols()[1 + command].reshape(SYMBOL, SYMBOL, 3)  # black on white
+        picture.paste(Image.fromarray(symbol), (x + (side - SYMBOL) // 2, y + (side - SYMBOL) // 2))
+        is_due = index == truth["carried_out"]
+        draw.rectangle((x, y, x + side, y + side), outline=ORANGE if is_due else GRAY, width=4 if is_due else 1)
+        if index < truth["carried_out"]:
+            draw.line([(x + 6, y + 24), (x + 16, y + 33), (x + 35, y + 8)], fill=GREEN, width=4)
+    return picture
+
+
+def moving(moments: list[Moment], out: Path) -> None:
+    """Write a frame for each moment, the two views beside each other."""
+    names = joined([np.asarray(text(name)) for name in ("agent's view", "debug view")], axis=1)
+    frames = []
+    for step, (truth, views) in enumerate(moments):
+        parts = [names, joined(views, axis=1), np.asarray(strip(step, truth, names.shape[1]))]
+        frames.append(Image.fromarray(np.concatenate(parts)))
+    durations = [MILLISECONDS] * (len(frames) - 1) + [LAST * MILLISECONDS]
+    frames[0].save(out, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
+
+
+def still(moments: list[Moment], out: Path) -> None:
+    """Write moments at even distances, the agent's view above the debug view."""
+    columns = [
+        np.concatenate([np.asarray(text(f"step {step}")), joined(moments[step].views, axis=0)])
+        for step in np.linspace(0, len(moments) - 1, COLUMNS).round().astype(int)
+    ]
+    pictures = Image.fromarray(joined(columns, axis=1))
+    whole = Image.new("RGB", (LABEL + pictures.width, pictures.height), "white")
+    whole.paste(pictures, (LABEL, 0))
     for row, words in enumerate(("agent's view", "debug view")):
-        whole.paste(text(words, VIEW).transpose(Image.Transpose.ROTATE_90), (0, LABEL + row * (VIEW + GAP)))
-    return whole
+        whole.paste(text(words).transpose(Image.Transpose.ROTATE_90), (0, LABEL + row * (VIEW + GAP)))
+    whole.resize((whole.width // 2, whole.height // 2)).save(out, optimize=True)
 
 
-def write(folder: Path) -> None:
-    """Write one picture for each family."""
-    for family in (mortar_mayhem, mystery_path, searing_spotlights):
-        labelled(family()).save(folder / f"{family.__name__}.png", optimize=True)
+def main(config: Config) -> None:
+    """Write the picture and print how the episode went."""
+    moments, info = play(config.checkpoint, config.level)
+    (moving if config.out.suffix == ".gif" else still)(moments, config.out)
+    print(f"level {config.level}: a return of {info['reward']:.2f} in {info['length']} steps")
 
 
 if __name__ == "__main__":
-    write(Path(sys.argv[1] if len(sys.argv) > 1 else "docs"))
+    main(tyro.cli(Config))
