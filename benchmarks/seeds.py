@@ -1,11 +1,12 @@
-"""What has each seed reached, beside random actions, a scripted player and the thesis? The picture of docs/results.md.
+"""What has each seed reached, beside random actions, a scripted player and the thesis? Two pictures of docs/results.md.
 
     python benchmarks/seeds.py
 
-A panel a task, a dot a seed: the score of the final weights on new test levels, from benchmarks/results. Endless tasks
-have a logarithmic axis, since the thesis trains much longer.
+docs/seeds.png has a panel a task, a dot a seed: the score of the final weights on new test levels. docs/endless.png has
+the curves of endless tasks on development levels, with steps on a logarithmic axis up to the thesis'.
 """
 
+import csv
 import sys
 from pathlib import Path
 
@@ -16,17 +17,16 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of 
 
 import learning
 import tables
+from ppo_utils.run_logs import Runs, align
 from suites import COLORS, TASKS
 
 RESULTS = Path(__file__).with_name("results")
 AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, before", "TrXL+")
 
 
-def main(out: Path = Path("docs/seeds.png")) -> None:
-    """Draw the picture to a file."""
+def draw_seeds(results: dict[str, Runs], out: Path) -> None:
+    """Draw a panel for each task, a dot for each seed. Endless tasks have a logarithmic axis."""
     bounds, thesis = tables.read_bounds(), tables.read_thesis()
-    config = learning.Config(suite="full", agents=AGENTS, results=RESULTS)
-    results = learning.results_of(config, learning.plans_of(config))
     figure = Figure(figsize=(13, 5.2), layout="constrained")
     for axis, (env_id, agents) in zip(figure.subplots(2, 5).flat, results.items(), strict=True):
         task = TASKS[env_id]
@@ -47,6 +47,36 @@ def main(out: Path = Path("docs/seeds.png")) -> None:
     handles = dict(zip(*reversed(figure.axes[0].get_legend_handles_labels()), strict=True))
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(out, dpi=110)
+
+
+def draw_endless(results: dict[str, Runs], out: Path) -> None:
+    """Draw the mean curves of the endless tasks, and what the thesis has after how many steps."""
+    with tables.THESIS.open(newline="") as file:
+        thesis = {row["task"]: row for row in csv.DictReader(file)}
+    endless = [env_id for env_id in results if env_id in thesis and thesis[env_id]["GRU million steps"]]
+    figure = Figure(figsize=(13, 3.4), layout="constrained")
+    for axis, env_id in zip(figure.subplots(1, len(endless)), endless, strict=True):
+        for agent, runs in results[env_id].items():
+            if runs:
+                steps, scores = align([run.curves[f"eval/{TASKS[env_id].score}"] for run in runs])
+                axis.plot(steps, scores.mean((1, 2, 3)), color=COLORS[agent], label=agent)
+        for theirs, agent in (("GRU", "GRU"), ("TrXL", "TrXL+")):
+            where = 1e6 * float(thesis[env_id][f"{theirs} million steps"]), float(thesis[env_id][theirs])
+            axis.plot(*where, "D", color=COLORS[agent], label=f"thesis, {theirs}")
+        axis.set(xscale="log", yscale="log", xlabel="steps", ylabel=TASKS[env_id].score)
+        axis.set_title(env_id, fontsize=10)
+        axis.grid(alpha=0.3)
+    handles = dict(zip(*reversed(figure.axes[0].get_legend_handles_labels()), strict=True))
+    figure.legend(handles.values(), handles, loc="outside right center", frameon=False)
+    figure.savefig(out, dpi=110)
+
+
+def main(folder: Path = Path("docs")) -> None:
+    """Draw both pictures to a folder."""
+    config = learning.Config(suite="full", agents=AGENTS, results=RESULTS)
+    results = learning.results_of(config, learning.plans_of(config))
+    draw_seeds(results, folder / "seeds.png")
+    draw_endless(results, folder / "endless.png")
 
 
 if __name__ == "__main__":

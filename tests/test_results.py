@@ -64,14 +64,15 @@ def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_pa
 
 def test_every_seed_is_a_dot(monkeypatch, tmp_path):
     dots = []
-    monkeypatch.setattr(Axes, "plot", lambda self, x, y, style, **_: dots.append((x, y)) if style == "o" else None)
-    seeds.main(tmp_path / "seeds.png")
+    monkeypatch.setattr(Axes, "plot", lambda self, x, y, style="", **_: dots.append((x, y)) if style == "o" else None)
+    seeds.main(tmp_path)
     drawn = [list(zip(x, y, strict=True)) for x, y in dots]
     assert len(drawn) == 50
     assert {len(each) for each in drawn} == {0, 3}, "some agents are not trained in all tasks"
     assert max(y for _, y in drawn[9]) == pytest.approx(1, abs=0.02), "TrXL+ in Mortar Mayhem Grid"
-    made, shown = (Image.open(folder / "seeds.png").size for folder in (tmp_path, ROOT / "docs"))
-    assert made == shown
+    for name in ("seeds.png", "endless.png"):
+        made, shown = (Image.open(folder / name).size for folder in (tmp_path, ROOT / "docs"))
+        assert made == shown
 
 
 def test_how_often_a_test_level_s_path_was_trained_on(tiny):
