@@ -417,13 +417,16 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         if waiting.size and self.autoreset_mode is AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(f"the episodes of lanes {waiting.tolist()} are over: reset them by reset_mask")
         rngs = self._rngs
-        if waiting.size:
-            # All lanes advance at once. These do it in a level that nobody sees, by generators that nobody needs.
-            self._rngs = [np.random.default_rng(0) if over else rng for over, rng in zip(self._over, rngs, strict=True)]
-            self.begin(waiting)
-        rewards, terminated, truncated = self._advance(actions)
-        if waiting.size:
+        try:
+            if waiting.size:
+                # All lanes advance at once. These do it in a level that nobody sees, by generators that nobody needs.
+                unseen = np.random.default_rng(0)
+                self._rngs = [unseen if over else rng for over, rng in zip(self._over, rngs, strict=True)]
+                self.begin(waiting)
+            rewards, terminated, truncated = self._advance(actions)
+        finally:  # also after an interrupt: the lanes still wait, and their next levels are the same
             self._rngs = rngs
+        if waiting.size:
             self._next_levels(waiting, [None] * self.num_envs)
             rewards[waiting], terminated[waiting], truncated[waiting] = 0.0, False, False
         self._over = terminated | truncated

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from unittest.mock import Mock
 
 import gymnasium as gym
 import numpy as np
@@ -33,6 +34,21 @@ def test_next_step_is_gymnasiums(env_id, obs_type):
         (None, None, None),
     ]
     check_resets_and_steps(ours, theirs, resets)
+
+
+@EACH
+def test_a_step_that_was_interrupted_skips_no_level(env_id, monkeypatch):
+    """All episodes have just ended, so the step that is tried again resets all lanes."""
+    envs, again = (make(env_id, autoreset_mode=NEXT, max_episode_steps=3) for _ in range(2))
+    for each in (envs, again):
+        each.reset(seed=5)
+        roll(each, 3)
+    with monkeypatch.context() as patch:
+        patch.setattr(again.unwrapped, "advance", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            again.step(again.action_space.sample())
+    actions = envs.action_space.sample()
+    check_same(envs.step(actions), again.step(actions))
 
 
 @EACH
