@@ -93,6 +93,8 @@ def prepare(args: RunArgs, script: str) -> tuple[Run, dict[str, np.ndarray], dic
         check_can_film(args.env_id)
     seed_process(args, checkpoint)
     torch.backends.cudnn.deterministic = True
+    # The momentum of idle units fills with numbers below 1e-38, which slow a CPU down several times: they become 0.
+    torch.set_flush_denormal(True)  # for this thread, and those that it starts
     device = torch.device("cpu")
     if torch.cuda.is_available() and args.cuda:
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import traceback
 import types
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import gymnasium as gym
@@ -124,6 +125,20 @@ def test_trains(tiny, scalars, env_id, memory):
         assert curves.keys() >= EPISODES
     if env_id == "Image-v0":
         assert set(curves["episode/solved"]) == {1.0}
+
+
+def test_numbers_that_slow_a_cpu_down_are_zero(tiny):
+    """Also in a thread that is started later, and those that compute a large product."""
+
+    def products():
+        return torch.full((1_000_000,), 1e-38) * 0.1
+
+    torch.set_flush_denormal(False)
+    assert products().any()
+    ppo_gru.main(tiny())
+    with ThreadPoolExecutor(1) as pool:
+        assert not products().any()
+        assert not pool.submit(products).result().any()
 
 
 def test_trains_on_vectors_and_their_frequencies(tiny, scalars):
