@@ -454,10 +454,11 @@ def main(config: Config) -> None:
     counts = Counter(found.text for found in verdicts.values())
     print(HEADING)
     for statement in STATEMENTS:
-        if not statement.claims and len(claims) < len(CLAIMS):
-            continue  # only some were asked for
+        names = [name for name in statement.claims if name in claims]
+        if not statement.claims and claims == CLAIMS:
+            names = [""]  # a row all the same, unless only some claims were asked for
         said = statement.text, statement.thesis  # once, above rows that say the same of other tasks
-        for name in [name for name in statement.claims if name in claims] or [""] * (not statement.claims):
+        for name in names:
             if name in verdicts:
                 print(row(name, runs[name], verdicts[name].text + " \\*" * stars[name], said))
             else:
