@@ -135,6 +135,7 @@ GRU, TRXL, PLUS, GATED = ("GRU",), ("TrXL",), ("TrXL+",), ("GTrXL+",)
 MEMORY, FRAMES = ("GRU", "TrXL+"), ("no memory", "16 frames")
 FEW_FRAMES = ("no memory", "4 frames", "step encoding")
 QUERY_POSITION, NORMALIZED = "TrXL --trxl-query-position", "GRU --norm-adv minibatch"
+QUICK_DECAY = "--anneal-steps 600000"  # as in the thesis, the rate is at its final value after a fifth of the training
 MORTAR_MAYHEMS = "MortarMayhem-Grid-v0 MortarMayhem-v0"
 MYSTERY_PATHS = "MysteryPath-Grid-v0 MysteryPath-v0"
 ENDLESS = "Endless-MortarMayhem-v0 Endless-MysteryPath-v0 Endless-SearingSpotlights-v0"
@@ -246,8 +247,7 @@ STATEMENTS = (
     Statement(
         "7.1.2 A higher final learning rate helps TrXL",
         "24, 18",
-        # The thesis' rate is at its final value after a fifth of the training.
-        {"learning-rate": in_endless(TRXL, ("TrXL --final-lr 1e-5",), flags="--anneal-steps 600000")},
+        {"learning-rate": in_endless(TRXL, ("TrXL --final-lr 1e-5",), flags=QUICK_DECAY)},
     ),
     Statement(
         "7.1.3 The step in the query helps TrXL a little",
@@ -262,6 +262,13 @@ STATEMENTS = (
     Statement(
         "7.1.3 Final rate, step in the query and ground truth together help less than ground truth alone",
         "33, 50 commands",
+        {
+            "together": in_endless(
+                ("TrXL --ground-truth-coef 0.1 --final-lr 1e-5",),
+                ("TrXL --ground-truth-coef 0.1 --trxl-query-position",),
+                flags=QUICK_DECAY,
+            )
+        },
     ),
     Statement("7.1.3 The previous output of the last block in the query harms", '"catastrophic"'),
     Statement(
