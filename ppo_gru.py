@@ -116,7 +116,7 @@ class Args(RunArgs):
     value_init_gain: NonNegativeFloat = 1.0
     """gain of the orthogonal initialization of the value's last layer; smaller: initial values closer to 0"""
     amp: bool = False
-    """compute in bfloat16, apart from recurrent layers, heads and losses"""
+    """compute the encoder, a transformer and the decoder in bfloat16"""
 
     memory: Literal["gru", "lstm", "none"] = "gru"
     """what the agent remembers with"""

@@ -19,9 +19,8 @@ How to read: section 2 is the training loop, from the top down; 3 to 5 are what 
 everything. In ppo_utils/ is what does not depend on the algorithm, and faster ways to compute the same.
 
 Shape letters: T steps of a rollout, N environments, A action branches, B steps of a minibatch, S segments in it, L
-steps of its longest segment, W window, M keys that are attended to, K blocks, R hidden states that a step stores (K, or
-K + 1), H attention heads, D width of the memory and I of its input (the same), F features of the trunk, G entries of
-the ground truth.
+steps of its longest segment, W window, M keys that are attended to, K blocks, H attention heads, D width of the memory
+and I of its input (the same), F features of the trunk, G entries of the ground truth.
 """
 
 from __future__ import annotations
@@ -120,7 +119,7 @@ class Args(RunArgs):
     value_init_gain: NonNegativeFloat = 0.01
     """gain of the orthogonal initialization of the value's last layer; smaller: initial values closer to 0"""
     amp: bool = False
-    """compute in bfloat16, apart from recurrent layers, heads and losses"""
+    """compute the encoder, a transformer and the decoder in bfloat16"""
 
     trxl_num_layers: PositiveInt = 3
     """blocks of the transformer"""

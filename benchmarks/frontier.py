@@ -47,7 +47,7 @@ def first_time(steps: np.ndarray, episodes: np.ndarray, commands: int) -> str:
 
 
 def draw(every: dict[str, tuple[np.ndarray, np.ndarray]], path: Path) -> None:
-    """Draw a map of the shares for each agent: a row a command, a column an evaluation."""
+    """Draw a map of the shares for each agent: one row per command, one column per evaluation."""
     figure = Figure(figsize=(10, 2.6), layout="constrained")
     axes = figure.subplots(1, len(every), sharey=True)
     for axis, (name, (steps, episodes)) in zip(axes, every.items(), strict=True):

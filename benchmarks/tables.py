@@ -1,6 +1,6 @@
 """Tables and pictures of what agents reached, and how they compare over several tasks.
 
-Shape letters, R seeds, M levels, E episodes, P points of a curve, B resamples, T tasks.
+Shape letters: R seeds, M levels, E episodes, P points of a curve, B resamples, T tasks.
 """
 
 import csv
@@ -26,8 +26,9 @@ from suites import COLORS, TASKS, Task
 
 BOUNDS, THESIS, NEW_LEVELS = (Path(__file__).with_name(f"{name}.csv") for name in ("bounds", "thesis", "new_levels"))
 LEVEL = 0.05  # agents differ if the p-value is below that
+SHOWN = ("show_origin", "show_goal")  # options that change how a level looks, not what it is
 RIVALS = ("no memory", "GRU")  # with which the others are compared over all tasks
-NAMES_APART = 0.075  # between the names at the curves' ends, as a share of the axis
+NAMES_APART = 0.075  # between the names beside the curves' ends, as a share of the axis
 
 
 @dataclass(frozen=True)
@@ -44,18 +45,25 @@ def read_bounds() -> dict[str, Bounds]:
         return {row["task"]: Bounds(float(row["random"]), float(row["scripted"])) for row in csv.DictReader(file)}
 
 
-def read_thesis() -> dict[str, str]:
-    """Read the interquartile means of GRU and TrXL that the thesis' text has, by task."""
+def read_thesis() -> dict[str, dict[str, str]]:
+    """Read the interquartile means of GRU and TrXL that the thesis' text has, and their steps, by task."""
     with THESIS.open(newline="") as file:
-        return {row["task"]: f"{row['GRU']}, {row['TrXL']}" for row in csv.DictReader(file)}
+        return {row["task"]: row for row in csv.DictReader(file)}
 
 
 @functools.cache
-def new_levels() -> dict[tuple[str, str], np.ndarray]:
+def read_new_levels() -> dict[tuple[str, str], np.ndarray]:
     """Read what benchmarks/trained_paths.py wrote: for id and reset options, whether each test level (M,) is new."""
     with NEW_LEVELS.open(newline="") as file:
         rows = {row["task"]: np.array([*row["new"]]) == "1" for row in csv.DictReader(file)}
     return {(TASKS[task].env_id, json.dumps(TASKS[task].options)): new for task, new in rows.items()}
+
+
+def scored_levels(env_id: str, options: dict[str, Any]) -> np.ndarray | None:
+    """Return which test levels (M,) begin as none of the first 100,000; None for all, also where that is none."""
+    without = {name: value for name, value in options.items() if name not in SHOWN}
+    new = read_new_levels().get((env_id, json.dumps(without)))
+    return new if new is not None and new.any() else None
 
 
 def final_scores(name: str, runs: list[RunLog], every_level: bool = False) -> np.ndarray:
@@ -66,11 +74,11 @@ def final_scores(name: str, runs: list[RunLog], every_level: bool = False) -> np
     """
     levels = "test" if are_tested(name, runs) else "eval"
     scores = align([run.curves[f"{levels}/{name}"] for run in runs])[1][-1]
-    played = [runs[0].args.get(name) for name in ("env_id", "env_options", "start_level", "num_levels")]
-    new = new_levels().get((*played[:2],)) if played[2:] == ["0", "100000"] else None
-    if every_level or levels == "eval" or new is None or not new.any():
+    args = runs[0].args
+    if every_level or levels == "eval" or (args.get("start_level"), args.get("num_levels")) != ("0", "100000"):
         return scores
-    return scores[:, new]
+    new = scored_levels(args["env_id"], json.loads(args["env_options"]))
+    return scores if new is None else scores[:, new]
 
 
 def are_tested(name: str, runs: list[RunLog]) -> bool:
@@ -124,7 +132,7 @@ def best_of(task: Task, agents: Runs) -> float:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two agents' numbers: by how many standard errors the first one's mean is higher, and how surely it is another."""
+    """Two agents' numbers: by how many standard errors the first one's mean is higher, and how likely by chance."""
 
     errors: float
     p_value: float  # two-sided
@@ -208,7 +216,7 @@ def is_ahead(scores: np.ndarray, others: np.ndarray) -> bool:
 
 
 # ---- ALL TASKS ----
-def overview(tasks: dict[str, Runs], bounds: dict[str, Bounds], thesis: dict[str, str]) -> str:
+def overview(tasks: dict[str, Runs], bounds: dict[str, Bounds], thesis: dict[str, dict[str, str]]) -> str:
     """Return a table with a row for each task: the mean score of each agent's final weights, and its standard error.
 
     Beside it stand the scores of random actions, of the scripted player and in the thesis, the steps of a training, and
@@ -237,7 +245,7 @@ def overview(tasks: dict[str, Runs], bounds: dict[str, Bounds], thesis: dict[str
             f"{known.random:.2f}" if known else "",
             *(cell(TASKS[name], agents.get(agent, [])) for agent in names),
             f"{known.scripted:.2f}" if known else "",
-            *[thesis.get(name, "") for _ in theirs],
+            *[", ".join(thesis[name][agent] for agent in ("GRU", "TrXL")) if name in thesis else "" for _ in theirs],
             " to ".join(dict.fromkeys(f"{each:.0f}" for each in (min(minutes), max(minutes)))),
         ]
         lines.append(f"| {' | '.join(cells)} |")
@@ -245,13 +253,13 @@ def overview(tasks: dict[str, Runs], bounds: dict[str, Bounds], thesis: dict[str
 
 
 def aggregate(tasks: dict[str, Runs], bounds: dict[str, Bounds]) -> str:
-    """Return a table over all tasks, a row an agent: its normalized IQM, and how probably it is better than `RIVALS`.
+    """Return a table over all tasks, one row per agent: its normalized IQM, how probably it is better than `RIVALS`.
 
     After Agarwal et al. (2021), "Deep Reinforcement Learning at the Edge of the Statistical Precipice". A seed's mean
     is normalized so that 0 is that of random actions and 1 the best (`best_of`); the IQM is over all tasks and seeds.
     The probability is that one seed is better than one of the rival's, averaged over tasks. Intervals, of 95 %, are
     those of a bootstrap that draws seeds for each task by itself. Only tasks that have bounds count. Return "" if they
-    are less than two, or not all agents have equally many seeds in all of them.
+    are fewer than two, or not all agents have equally many seeds in all of them.
     """
     tasks = {name: agents for name, agents in tasks.items() if name in bounds}
     counts = {len(runs) for agents in tasks.values() for runs in agents.values()}
@@ -324,13 +332,15 @@ def draw_task(axis: Axes, task: Task, agents: Runs, colors: dict[str, Any]) -> N
         ends[agent], top = (x[-1], means[-1]), max(top, (means + errors).max())
     top = task.best_score or top or 1.0
     axis.set(xlabel="steps", ylabel=task.score, ylim=(0, top))
+    axis.margins(x=0)
     axis.xaxis.set_major_formatter(EngFormatter(sep=" "))
     axis.grid(alpha=0.3)
     axis.spines[["top", "right"]].set_visible(False)
     places = spread([y / top for _, y in ends.values()], NAMES_APART)
-    for (agent, (x, _)), place in zip(ends.items(), places, strict=True):
-        where = {"xy": (x, place * top), "xytext": (4, 0), "textcoords": "offset points", "annotation_clip": False}
-        axis.annotate(textwrap.fill(agent, 28), **where, color=colors[agent], fontsize="small", va="center")
+    for (agent, end), place in zip(ends.items(), places, strict=True):
+        where = {"xytext": (1.05, place), "textcoords": "axes fraction", "annotation_clip": False, "va": "center"}
+        line = {"arrowstyle": "-", "color": colors[agent], "linewidth": 0.6, "shrinkA": 0, "shrinkB": 0}
+        axis.annotate(textwrap.fill(agent, 28), end, **where, color=colors[agent], fontsize="small", arrowprops=line)
 
 
 def spread(places: list[float], apart: float) -> list[float]:

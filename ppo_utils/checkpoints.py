@@ -208,7 +208,10 @@ def load_weights(agent: nn.Module, saved: dict[str, Any], path: str | Path) -> N
 
 # ---- going on ----
 def check_resumed(args: RunArgs, saved: dict[str, Any], script: str) -> None:
-    """Raise ValueError if the arguments are not those of the run that --resume goes on with."""
+    """Raise ValueError if the arguments are not those of the run that --resume goes on with.
+
+    Those that are None until the run's others are known become the run's.
+    """
     if saved["script"] != script:
         raise ValueError(f"--resume {args.resume}: this run is {saved['script']}.py's, not {script}.py's")
     if "processes" not in saved:
@@ -217,6 +220,9 @@ def check_resumed(args: RunArgs, saved: dict[str, Any], script: str) -> None:
     if gone := saved["args"].keys() - asdict(theirs).keys():
         names = " ".join(map(flag, sorted(gone)))
         tell(f"--resume {args.resume}: it goes on without {names}, which no longer exist")
+    for name in ("anneal_steps", "vector_frequencies"):
+        if getattr(args, name) is None:  # as it was when the run began; `check_args` replaces it
+            setattr(args, name, getattr(theirs, name))
     for name in (each.name for each in fields(args) if each.name not in ("resume", "total_timesteps")):
         if getattr(args, name) != getattr(theirs, name):
             raise ValueError(

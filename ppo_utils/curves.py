@@ -200,7 +200,7 @@ def wall_time(runs: list[RunLog]) -> dict[str, float]:
 
 
 def time_table(agents: list[dict[str, Any]]) -> str:
-    """Return the wall times in the summaries of agents that have one as a Markdown table, an agent a row."""
+    """Return the wall times in the summaries of agents that have one as a Markdown table, one row per agent."""
     names = ("mean", "std", "min", "median", "IQM", "max", "collect", "update", "hours")
     lines = [f"| agent | seeds | {' | '.join(names)} |", f"|---|---:|{'---:|' * len(names)}"]
     for agent in agents:

@@ -16,6 +16,7 @@ from ppo_utils.errors import report_unusable_policy
 from ppo_utils.flags import RunArgs
 from ppo_utils.infos import final_numbers, ground_truth_of
 from ppo_utils.terminal import tell
+from ppo_utils.wrappers import WRAPPERS
 
 REPEATS = 3  # times that each level is played
 AT_ONCE = 1000  # levels whose beginnings are looked at
@@ -50,7 +51,8 @@ def beginnings(args: RunArgs, first: int, count: int) -> list[bytes]:
 
     That is path, commands, coins and places. Raises ValueError for other environments.
     """
-    envs = envs_for(args, AT_ONCE, obs_type="vector", num_levels=0, asynchronous=False)
+    plain = {"obs_type": "vector", "num_levels": 0, "asynchronous": False, **dict.fromkeys(WRAPPERS, 0)}
+    envs = envs_for(args, AT_ONCE, **plain)
     if not hasattr(envs.unwrapped, "oracle"):
         raise ValueError(f"--new-levels: {args.env_id} does not tell what a level holds")
     found = []

@@ -153,7 +153,9 @@ class Muon(torch.optim.Muon):
         for (rows, columns), members in by_shape.items():
             directions = []
             for weight in members:
-                momentum = self.state[weight].setdefault("momentum_buffer", torch.zeros_like(weight))
+                if not self.state[weight]:
+                    self.state[weight]["momentum_buffer"] = torch.zeros_like(weight)
+                momentum = self.state[weight]["momentum_buffer"]
                 momentum.lerp_(weight.grad, 1 - group["momentum"])
                 directions.append(weight.grad.lerp(momentum, group["momentum"]))
             steps = orthogonalize(torch.stack(directions), group["ns_coefficients"], group["ns_steps"])

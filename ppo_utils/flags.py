@@ -152,7 +152,7 @@ def check_bounds(args: RunArgs) -> None:
         for part in (kind, *get_args(kind)):  # float | None has its bounds in a part
             bounds = next((each for each in getattr(part, "__metadata__", ()) if isinstance(each, Bounds)), None)
             if bounds is not None and value is not None and not bounds.include(value):
-                limit = f" and at most {LARGEST}, where float32 ends" if value > LARGEST else ""
+                limit = f" and at most {LARGEST}, where float32 ends" if value > LARGEST == bounds.high else ""
                 raise ValueError(f"{flag(name)} is {value}; it must be {bounds}{limit}")
         if isinstance(value, int) and value >= 2**63:  # torch and NumPy take no more
             raise ValueError(f"{flag(name)} is {value}; it must be below 2 ** 63")

@@ -20,7 +20,7 @@ from tensorboard.backend.event_processing.event_file_loader import EventFileLoad
 from tensorboard.util.tensor_util import make_ndarray
 
 from ppo_utils.checkpoints import FORMER_DEFAULTS, RENAMED, import_script
-from ppo_utils.scores import own_metric
+from ppo_utils.scores import bare_id, own_metric
 
 POINTS = 200  # of a curve; one that has more is averaged over neighbours
 # Scalars of every iteration, in seconds: the first is the sum of the others. Evaluations are in none of them.
@@ -95,7 +95,7 @@ def with_carried_out(run: RunLog) -> RunLog:
     In the endless task, they had the same number under another name. In the others, the return tells the share: it is
     0.1 for each command unless reset options say otherwise.
     """
-    if run.args.get("env_id", "").startswith("Endless-MortarMayhem"):
+    if bare_id(run.args.get("env_id", "")).startswith("Endless-MortarMayhem"):
         curves = {name.replace("commands_completed", "carried_out"): each for name, each in run.curves.items()}
         return replace(run, curves=curves)
     options = json.loads(run.args.get("env_options", "{}"))

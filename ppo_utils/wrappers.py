@@ -498,7 +498,7 @@ WRAPPERS = {
     "spotlight_perturbation": lambda envs, _: SpotlightPerturbation(envs),
     "attend_commands": lambda envs, _: CommandList(envs) if is_act_task(envs) else envs,
     "frame_stack": stacked,
+    "vector_frequencies": FourierFeatures,  # before entries that are not from 0 to 1
     "step_encoding": lambda envs, _: StepEncoding(envs),
     "observe_last_action": lambda envs, _: LastAction(envs),
-    "vector_frequencies": FourierFeatures,
 }

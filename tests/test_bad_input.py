@@ -42,6 +42,7 @@ CASES = {
     "--vector-frequencies 4": "needs an observation with a vector, not with observation alone",
     "--vector-frequencies 17": "--vector-frequencies is 17; it must be 0 to 16",
     "--gamma 1.5": "--gamma is 1.5; it must be 0 to 1",
+    "--gamma 1e39": r"--gamma is 1e\+39; it must be 0 to 1$",
     "--init-lr nan": "--init-lr is nan; it must be 0 to 1",
     "--final-lr inf": "--final-lr is inf; it must be 0 to 1",
     "--clip-coef 0": "--clip-coef is 0.0; it must be above 0",

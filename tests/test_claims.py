@@ -113,8 +113,8 @@ def test_where_nobody_is_above_an_agent_without_memory_nothing_was_learned():
     ("name", "least"),
     [
         ("samples-MortarMayhem-Grid-v0", 0.25),
-        ("falls-MysteryPath-Grid-v0", 0.9),
         ("score-Endless-MortarMayhem-v0", 4.5),  # of 18
+        ("same-score-Endless-MortarMayhem-v0-20M", 4.5),
         ("score-Endless-MysteryPath-v0", 0.505),  # of 2.02
     ],
 )
@@ -127,6 +127,34 @@ def test_a_task_of_which_little_was_learned(name, least):
 
     assert claims.is_learned(claim, {"GRU": runs(least + 0.01), "TrXL": runs(0.1)}, [])
     assert not claims.is_learned(claim, {"GRU": runs(least - 0.01), "TrXL": runs(0.1)}, [])
+
+
+def test_falls_are_compared_of_agents_that_have_learned_the_task():
+    """Both, not one of them."""
+    claim = claims.CLAIMS["falls-MysteryPath-Grid-v0"]
+
+    def runs(mean):
+        return [RunLog("", {}, {"eval/success": (np.array([100]), np.full((1, 4, 1), mean))})] * 2
+
+    assert claims.is_learned(claim, {"GRU": runs(0.91), "TrXL+": runs(0.95)}, [])
+    assert not claims.is_learned(claim, {"GRU": runs(0.89), "TrXL+": runs(0.95)}, [])
+
+
+def test_verdicts_say_how_likely_they_come_by_chance():
+    assert str(claims.Verdict("holds", 0.0274)) == "holds, p = 0.027"
+    assert str(claims.Verdict("holds", 0.0004)) == "holds, p < 0.001"
+    assert str(claims.Verdict("not decided")) == "not decided"
+
+
+def test_agents_of_a_comparison_of_equals_have_equal_settings():
+    """Of those that the preset sets apart, and of those that Mystery Path has for the GRU."""
+    names = ("init_lr", "gamma", "vf_coef", "clip_coef", "norm_reward", "exploration_bonus", "init_ent_coef")
+    same = [claim for name, claim in claims.CLAIMS.items() if name.startswith("same-")]
+    assert len(same) == 10
+    for claim in same:
+        plans = [claim.plans(claims.Config(seeds=(1,)), agent)[0] for agent in claim.agents]
+        assert plans[0].args.__class__ is not plans[1].args.__class__
+        assert len({tuple(getattr(plan.args, name) for name in names) for plan in plans}) == 1, claim
 
 
 def test_test_levels_decide():
@@ -197,7 +225,7 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     claims.main(replace(config, report=True, seeds=(1, 2, 3)))
     told = capsys.readouterr().out
     assert "trained" not in told
-    assert "| not run | `normalized-gradients` |" in told
+    assert f"\n| not run | thesis | `--claims` |\n|---|---|---|\n{start} | `normalized-gradients` |\n" in told
     assert told.splitlines()[-1].startswith("Of 1 rows: 1 not run.")
 
 
@@ -244,7 +272,10 @@ def test_rows_of_one_statement(monkeypatch, capsys):
 def test_statements_without_runs_have_a_row(monkeypatch, capsys):
     monkeypatch.setattr(learning, "result_of", lambda config, plan: None)
     claims.main(claims.Config(report=True))
-    rows = [line for line in capsys.readouterr().out.splitlines() if "| not run |" in line]
-    assert len(rows) == len(claims.CLAIMS) + sum(not statement.claims for statement in claims.STATEMENTS)
-    assert rows[0].endswith("|  |  |  | not run | `memory-MortarMayhem-Grid-v0` |")
+    _, head, _, *rows, _, summary = capsys.readouterr().out.splitlines()
+    assert head == "| not run | thesis | `--claims` |"
+    assert len(rows) == len(claims.STATEMENTS)
+    assert rows[0].endswith("|  | `memory-MortarMayhem-Grid-v0`, `memory-MortarMayhem-v0` |")
     assert rows[-1].startswith("| 7.2 In BossFight,")
+    count = len(claims.CLAIMS) + sum(not statement.claims for statement in claims.STATEMENTS)
+    assert summary == f"Of {count} rows: {count} not run. With a star: 0."

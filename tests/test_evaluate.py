@@ -423,9 +423,11 @@ def test_what_an_older_run_of_mortar_mayhem_carried_out():
         assert "eval/carried_out" not in older(unknown)
 
 
-def test_an_older_run_of_endless_mortar_mayhem_has_the_same_number_under_another_name():
+@pytest.mark.parametrize("module", ["", "memory_gym_envs:"])
+def test_an_older_run_of_endless_mortar_mayhem_has_the_same_number_under_another_name(module):
     with SummaryWriter("older") as writer:
-        writer.add_text("hyperparameters", "|param|value|\n|-|-|\n|seed|3|\n|env_id|Endless-MortarMayhem-v0|")
+        rows = f"|seed|3|\n|env_id|{module}Endless-MortarMayhem-v0|"
+        writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
         for name in ("eval/commands_completed", "episode/commands_completed", "eval/return"):
             writer.add_scalar(name, 7.0, 10)
     found = read_run("older").curves

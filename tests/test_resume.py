@@ -162,6 +162,18 @@ def test_a_longer_training_goes_on_where_the_shorter_one_ended(tiny, curves, scr
     assert curves(short) == whole
 
 
+def test_a_run_goes_on_with_the_arguments_that_it_began_with(tiny, curves):
+    """In Python, where some are None until the others are known, as on the command line."""
+    args = tiny(env_id="MysteryPath-Grid-v0", obs_type="vector", anneal_steps=None)
+    assert args.vector_frequencies is None
+    folder = ppo_gru.main(dataclasses.replace(args))
+    longer = dataclasses.replace(args, resume=str(folder), total_timesteps=192)
+    assert ppo_gru.main(longer) == folder
+    assert {step for step, _ in curves(folder)["losses/loss"]} == {64, 128, 192}
+    with pytest.raises(ValueError, match=r"--vector-frequencies is 0, but the run in .* has 4"):
+        ppo_gru.main(dataclasses.replace(longer, vector_frequencies=0))
+
+
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_what_was_played_twice_is_logged_once(tiny, curves, monkeypatch, script):
     """A crash after the checkpoint: an iteration and its evaluation are done again."""

@@ -576,6 +576,13 @@ def test_fourier_features_are_those_of_all_vectors():
         np.testing.assert_allclose(obs[name], np.stack(wanted, 2).reshape(2, -1), atol=1e-5)
 
 
+def test_fourier_features_are_made_of_what_is_from_0_to_1():
+    """Of the vector, not of the step's encoding or the last reward, which have no such bounds."""
+    flags = {"vector_frequencies": 2, "step_encoding": True, "observe_last_action": True}
+    space = make_envs("MysteryPath-Grid-v0", 2, obs_type="vector", **flags).single_observation_space
+    assert space["sines"].shape == space["cosines"].shape == (2 * 16,)
+
+
 def test_fourier_features_without_a_vector():
     envs = gym.make_vec("MysteryPath-v0", num_envs=2)
     with pytest.raises(ValueError, match="needs an observation with a vector, not with observation alone"):
