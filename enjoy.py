@@ -446,10 +446,10 @@ def memory_of(args: Any) -> str:
         parts += [f"{encoding} positional encoding", f"{args.trxl_layer_norm}-norm"]
     else:
         parts = [args.exp_name]
-    flags = {name: getattr(args, name, False) for name in ("trxl_query_position",)}
-    for name, value in (flags | wrappers_of(args)).items():
+    flags = {"query_position": getattr(args, "trxl_query_position", False), **wrappers_of(args)}
+    for name, value in flags.items():
         if value:
-            parts.append(name.removeprefix("trxl_").replace("_", " ") + (f" {value}" if value is not True else ""))
+            parts.append(name.replace("_", " ") + (f" {value}" if value is not True else ""))
     return ", ".join(parts)
 
 

@@ -26,6 +26,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -55,30 +56,10 @@ TASKS = {
 SHARE, SHARE_OF_FALLS = 0.25, 0.9
 
 
-# What is compared, (R, M): of each seed, on each of the levels, which all runs have.
-def final(name: str, runs: list[RunLog]) -> np.ndarray:
-    """Return what the final weights have on the test levels, by the name of a metric or score."""
-    return tables.final_scores(name, runs).mean(-1)
-
-
-def score(task: Task, runs: list[RunLog]) -> np.ndarray:
-    """Return the task's scores of the final weights."""
-    return final(task.score, runs)
-
-
+# What is compared beside metrics of the final weights: of each seed, on each level, (R, M).
 def area(task: Task, runs: list[RunLog]) -> np.ndarray:
     """Return the means of the curves on development levels: they are higher where fewer samples are needed."""
     return align([run.curves[f"eval/{task.score}"] for run in runs])[1].mean((0, -1))
-
-
-def falls(task: Task, runs: list[RunLog]) -> np.ndarray:
-    """Return how often the final weights fall off."""
-    return final("num_fails", runs)
-
-
-def length(task: Task, runs: list[RunLog]) -> np.ndarray:
-    """Return the lengths of the final weights' episodes."""
-    return final("length", runs)
 
 
 def gradient_norm(task: Task, runs: list[RunLog]) -> np.ndarray:
@@ -96,7 +77,7 @@ class Claim:
     task: str
     higher: tuple[str, ...]
     lower: tuple[str, ...]
-    measure: Callable[[Task, list[RunLog]], np.ndarray] = score
+    measure: str | Callable[[Task, list[RunLog]], np.ndarray] = ""  # a metric, by default the task's own, or a function
     flags: str = ""  # of all agents
     expects_difference: bool = True
 
@@ -112,7 +93,10 @@ class Claim:
 
     def numbers(self, runs: list[RunLog]) -> np.ndarray:
         """Return what is compared, (R, M)."""
-        return self.measure(TASKS[self.task], runs)
+        task = TASKS[self.task]
+        if callable(self.measure):
+            return self.measure(task, runs)
+        return tables.final_scores(self.measure or task.score, runs).mean(-1)
 
 
 @dataclass(frozen=True)
@@ -129,11 +113,7 @@ def claims_of(prefix: str, tasks: str, higher: tuple[str, ...], lower: tuple[str
     return {f"{prefix}-{task}": Claim(task, higher, lower, **others) for task in tasks.split()}
 
 
-def in_endless(higher: tuple[str, ...], lower: tuple[str, ...], **others) -> Claim:
-    """Return a claim about the small Endless Mortar Mayhem."""
-    return Claim("small-endless", higher, lower, **others)
-
-
+in_endless = partial(Claim, "small-endless")
 GRU, TRXL, PLUS, GATED = ("GRU",), ("TrXL",), ("TrXL+",), ("GTrXL+",)
 SAME = ("TrXL+, before",)  # with the GRU's learning rate, discount factor and weight of the value
 MEMORY, FRAMES = ("GRU", "TrXL+"), ("no memory", "16 frames")
@@ -226,7 +206,7 @@ STATEMENTS = (
     Statement(
         "6.3 GRU's endless episodes are longer",
         "3,462 (at its peak), 288 steps; 600, 400; 600, 200",
-        claims_of("length", f"{ENDLESS} Endless-MortarMayhem-v0-20M", GRU, PLUS, measure=length),
+        claims_of("length", f"{ENDLESS} Endless-MortarMayhem-v0-20M", GRU, PLUS, measure="length"),
     ),
     Statement("6.3 GRU still learns at the end of Endless Mystery Path and Searing Spotlights", "after 819 M steps"),
     Statement("6.3 TrXL is worse with reconstruction in Endless Mortar Mayhem", "18, with it 10 commands"),
@@ -243,7 +223,7 @@ STATEMENTS = (
     Statement(
         "6.5.2 GRU falls off more often in Mystery Path",
         "5.65, 4.87 times",
-        claims_of("falls", MYSTERY_PATHS, GRU, PLUS, measure=falls),
+        claims_of("falls", MYSTERY_PATHS, GRU, PLUS, measure="num_fails"),
     ),
     Statement(
         "7.1.1 A larger TrXL stays behind GRU",
@@ -397,15 +377,15 @@ def is_learned(claim: Claim, runs: dict[str, list[RunLog]], without: list[RunLog
     Where falls are counted, all need the share. The latter is asked if there are runs of that; if an agent without
     memory is one of the claim's, another has to pass it.
     """
-    task, aim = TASKS[claim.task], aim_of(claim.task)
-    share, which = (SHARE_OF_FALLS, min) if claim.measure is falls else (SHARE, max)
-    if aim is not None and which(score(task, members).mean() for members in runs.values()) < share * aim:
+    name, aim = TASKS[claim.task].score, aim_of(claim.task)
+    scores = {agent: tables.final_scores(name, members).mean(-1) for agent, members in runs.items()}
+    share, which = (SHARE_OF_FALLS, min) if claim.measure == "num_fails" else (SHARE, max)
+    if aim is not None and which(each.mean() for each in scores.values()) < share * aim:
         return False
     if len(without) < 2:
         return True
-    base = score(task, without)
-    scores = [score(task, members) for agent, members in runs.items() if not agent.startswith("no memory")]
-    return any(Comparison.of(each, base).is_ahead for each in scores)
+    base = tables.final_scores(name, without).mean(-1)
+    return any(Comparison.of(scores[agent], base).is_ahead for agent in runs if not agent.startswith("no memory"))
 
 
 def holm(p_values: list[float]) -> list[bool]:

@@ -18,10 +18,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of 
 import learning
 from ppo_utils.run_logs import align
 
-RESULTS = Path(__file__).with_name("results")
 COUNT = 10  # commands of the tasks' default options
-MOST = 0.9  # a command is learned when so many of those who come to it carry it out
-FEWEST = 20  # episodes that a share in the picture is of
+LEARNED_SHARE = 0.9  # a command is learned when so many of those who come to it carry it out
+MIN_EPISODES = 20  # episodes that a share in the picture is of
 RUNS = {  # what the table and picture call them: task, steps, and the agent of learning.py
     "GRU, clue and act": ("MortarMayhem-Grid-v0", 6e6, "GRU"),
     "TrXL+, clue and act": ("MortarMayhem-Grid-v0", 6e6, "TrXL+"),
@@ -32,8 +31,7 @@ RUNS = {  # what the table and picture call them: task, steps, and the agent of 
 
 def reached(task: str, steps: float, agent: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the steps (P,) and how many episodes carried out at least 0 to C commands, (P, C + 1)."""
-    config = learning.Config(tasks=(task,), steps=int(steps), agents=(agent,), results=RESULTS)
-    (runs,) = learning.results_of(config, learning.plans_of(config))[task].values()
+    (runs,) = learning.stored_results(tasks=(task,), steps=int(steps), agents=(agent,))[task].values()
     steps_of, shares = align([run.curves["eval/carried_out"] for run in runs])  # (P,), (P, R, M, E)
     counts = np.rint(COUNT * shares.reshape(len(shares), -1, 1))
     return steps_of, (counts >= np.arange(COUNT + 1)).sum(1)
@@ -42,7 +40,7 @@ def reached(task: str, steps: float, agent: str) -> tuple[np.ndarray, np.ndarray
 def first_time(steps: np.ndarray, episodes: np.ndarray, commands: int) -> str:
     """Return in millions the first of the steps (P,) at which all of so many first commands are learned; or nothing."""
     shares = episodes[:, 1 : commands + 1] / np.maximum(episodes[:, :commands], 1)
-    there = np.flatnonzero((shares >= MOST).all(1))
+    there = np.flatnonzero((shares >= LEARNED_SHARE).all(1))
     return f"{steps[there[0]] / 1e6:.2f}" if there.size else ""
 
 
@@ -51,7 +49,7 @@ def draw(every: dict[str, tuple[np.ndarray, np.ndarray]], path: Path) -> None:
     figure = Figure(figsize=(10, 2.6), layout="constrained")
     axes = figure.subplots(1, len(every), sharey=True)
     for axis, (name, (steps, episodes)) in zip(axes, every.items(), strict=True):
-        shares = np.where(episodes[:, :-1] >= FEWEST, episodes[:, 1:] / np.maximum(episodes[:, :-1], 1), np.nan)
+        shares = np.where(episodes[:, :-1] >= MIN_EPISODES, episodes[:, 1:] / np.maximum(episodes[:, :-1], 1), np.nan)
         ends = (0, steps[-1] / 1e6, 0.5, COUNT + 0.5)
         image = axis.imshow(shares.T, origin="lower", extent=ends, aspect="auto", vmin=0, vmax=1, cmap="viridis")
         axis.set_title(name.replace(", ", "\n", 1), fontsize=9)

@@ -453,6 +453,12 @@ def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
     }
 
 
+def stored_results(**config: Any) -> dict[str, Runs]:
+    """Return the runs in benchmarks/results that a `Config` describes, by task and agent."""
+    stored = Config(results=ROOT / "benchmarks/results", **config)
+    return results_of(stored, plans_of(stored))
+
+
 def results_of(config: Config, plans: dict[tuple[str, str, int], Plan]) -> dict[str, Runs]:
     """Return the finished runs by task and agent: a list for each, empty where there is no result."""
     tasks = {task: {} for task, _, _ in plans}

@@ -20,7 +20,6 @@ import tables
 from ppo_utils.run_logs import Runs, align
 from suites import COLORS, TASKS
 
-RESULTS = Path(__file__).with_name("results")
 AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, before", "TrXL+")
 LONGER = {"Endless-MortarMayhem-v0": 20_000_000, "Endless-MysteryPath-v0": 9_000_000}  # steps, if there are such
 
@@ -54,8 +53,7 @@ def with_longer(results: dict[str, Runs]) -> dict[str, Runs]:
     """Return the results with longer runs in place of shorter ones of the same agents."""
     found = dict(results)
     for env_id, steps in LONGER.items():
-        config = learning.Config(tasks=(env_id,), steps=steps, agents=AGENTS, results=RESULTS)
-        (longer,) = learning.results_of(config, learning.plans_of(config)).values()
+        (longer,) = learning.stored_results(tasks=(env_id,), steps=steps, agents=AGENTS).values()
         found[env_id] = results[env_id] | {agent: runs for agent, runs in longer.items() if runs}
     return found
 
@@ -83,8 +81,7 @@ def draw_endless(results: dict[str, Runs], out: Path) -> None:
 
 def main(folder: Path = Path("docs")) -> None:
     """Draw both pictures to a folder."""
-    config = learning.Config(suite="full", agents=AGENTS, results=RESULTS)
-    results = learning.results_of(config, learning.plans_of(config))
+    results = learning.stored_results(suite="full", agents=AGENTS)
     draw_seeds(results, folder / "seeds.png")
     draw_endless(with_longer(results), folder / "endless.png")
 

@@ -20,10 +20,10 @@ import learning
 import tables
 from suites import TASKS
 
-RESULTS, ENTRIES = (Path(__file__).with_name(name) for name in ("results", "speedrun.csv"))
+ENTRIES = Path(__file__).with_name("speedrun.csv")
 SEEDS = (1, 2, 3, 4, 5)
 LEVEL = 0.01  # of the test that the mean is above the target
-LEAST = 0.0001  # p-value that is printed
+SMALLEST_PRINTED = 0.0001  # p-value
 HEADING = """| task | target | agent | score | p <= | steps | minutes | date, commit |
 |---|---:|---|---:|---:|---:|---:|---|"""
 
@@ -52,11 +52,10 @@ def row(entry: Entry) -> str:
 
     Raises SystemExit if a seed has no result, or if they are not above the target: then it is no entry.
     """
-    how = {"steps": entry.steps, "seeds": SEEDS, "results": RESULTS}
-    config = learning.Config(tasks=(entry.task,), agents=(entry.agent,), **how)
-    (runs,) = learning.results_of(config, learning.plans_of(config))[entry.task].values()
+    tasks, agents = (entry.task,), (entry.agent,)
+    (runs,) = learning.stored_results(tasks=tasks, agents=agents, steps=entry.steps, seeds=SEEDS)[entry.task].values()
     if len(runs) < len(SEEDS):
-        raise SystemExit(f"{RESULTS} has {len(runs)} of {len(SEEDS)} seeds of {entry.agent} in {entry.task}")
+        raise SystemExit(f"benchmarks/results has {len(runs)} of {len(SEEDS)} seeds of {entry.agent} in {entry.task}")
     scores = tables.final_scores(TASKS[entry.task].score, runs)  # (R, M, E)
     p_value = probability(scores.mean((1, 2)), entry.target)
     if not p_value < LEVEL:  # of equal scores, it is NaN
@@ -66,7 +65,7 @@ def row(entry: Entry) -> str:
         f"{entry.target:g}",
         f"`{entry.agent}`",
         tables.mean_and_error(scores),
-        f"{max(p_value, LEAST):.4f}",
+        f"{max(p_value, SMALLEST_PRINTED):.4f}",
     ]
     cells += [f"{entry.steps / 1e6:g} M", f"{tables.minutes_of(runs):.1f}", f"{entry.date}, {entry.commit}"]
     return f"| {' | '.join(cells)} |"

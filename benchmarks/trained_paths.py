@@ -27,13 +27,12 @@ from ppo_utils.evaluation import beginnings
 from ppo_utils.flags import RunArgs
 from suites import COLORS, TASKS
 
-RESULTS = Path(__file__).with_name("results")
 AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, low rate", "TrXL+")
-IN = ("MysteryPath-Grid-v0", "MysteryPath-v0")  # tasks that have the same paths
+PATH_TASKS = ("MysteryPath-Grid-v0", "MysteryPath-v0")  # tasks that have the same paths
 LEVELS = 100_000  # that are trained on by default
-TEST_LEVELS = 1000
+TEST_LEVELS = learning.Training.test_levels
 COUNTED = {  # what the table calls them: id, reset options
-    **{name: (task.env_id, json.dumps(task.options)) for name, task in TASKS.items() if "ndless" not in name},
+    **{name: (task.env_id, json.dumps(task.options)) for name, task in TASKS.items() if task.best_score is not None},
     "quickstart": (ppo_gru.Args().env_id, ppo_gru.QUICKSTART["env_options"]),
 }
 EDGES = (0, 1, 2, 5, 11, 31, 101, np.inf)  # a column's levels: path so often in the training, below the next
@@ -76,11 +75,9 @@ def print_scores(out: Path) -> None:
     """Print a table for each task, and draw them."""
     figure = Figure(figsize=(9, 2.8), layout="constrained")
     columns = ["0", "1", "2-4", "5-10", "11-30", "31-100", "more"]
-    config = learning.Config(tasks=IN, agents=AGENTS, results=RESULTS)
-    plans = learning.plans_of(config)
-    times = times_trained_on(next(iter(plans.values())).args, config.test_levels)
+    times = times_trained_on(ppo_gru.Args(env_id=PATH_TASKS[0]), TEST_LEVELS)
     inside = [(low <= times) & (times < high) for low, high in pairwise(EDGES)]
-    results = learning.results_of(config, plans)
+    results = learning.stored_results(tasks=PATH_TASKS, agents=AGENTS)
     for axis, (env_id, agents) in zip(figure.subplots(1, 2, sharey=True), results.items(), strict=True):
         print(f"| {env_id}, path trained on | {' | '.join(columns)} | all |\n|---|{'---:|' * (len(columns) + 1)}")
         print(f"| test levels | {' | '.join(str(each.sum()) for each in inside)} | {len(times):,} |")

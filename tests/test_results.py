@@ -87,7 +87,7 @@ def test_how_often_a_test_level_s_path_was_trained_on(tiny):
     trained_on = paths(0) + paths(1000)
     wanted = [trained_on.count(path) for path in paths(learning.FIRST_TEST_LEVEL)]
     assert len(set(wanted)) > 5
-    for env_id in trained_paths.IN:
+    for env_id in trained_paths.PATH_TASKS:
         times = trained_paths.times_trained_on(tiny(env_id=env_id, num_levels=2000), 1000)
         assert times.tolist() == wanted
 
