@@ -58,7 +58,7 @@ def interval(scores: np.ndarray) -> np.ndarray | None:
 
 
 def error_over_levels(scores: np.ndarray) -> float | None:
-    """Return the standard error of the mean of scores (R, M, E) for other levels; None for several seeds or a single level.
+    """Return the standard error of the mean of scores (R, M, E) for other levels; None for several seeds or one level.
 
     Where there are several seeds, their differences count too, which the bootstrap's interval shows.
     """
