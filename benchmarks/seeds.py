@@ -1,15 +1,16 @@
-"""What has each seed reached, beside random actions, a scripted player and the thesis? Two pictures of docs/results.md.
+"""What has each seed reached, beside random actions, a scripted player and the thesis? Pictures of docs/results.md.
 
     python benchmarks/seeds.py
 
 docs/seeds.png has a panel for each task and a dot for each seed: the score of the final weights on new test levels.
 docs/endless.png has the curves of endless tasks on development levels, with steps on a logarithmic axis up to the
-thesis'.
+thesis', docs/commands.png after how many commands episodes of Endless Mortar Mayhem end.
 """
 
 import sys
 from pathlib import Path
 
+import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
@@ -22,6 +23,7 @@ from suites import COLORS, TASKS
 
 AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, before", "TrXL+")
 LONGER = {"Endless-MortarMayhem-v0": 20_000_000, "Endless-MysteryPath-v0": 9_000_000}  # steps, if there are such
+IN_WINDOW = 10  # commands of Endless Mortar Mayhem before a window of 256 steps no longer has the first clue
 
 
 def draw_seeds(results: dict[str, Runs], out: Path) -> None:
@@ -79,11 +81,29 @@ def draw_endless(results: dict[str, Runs], out: Path) -> None:
     figure.savefig(out, dpi=110)
 
 
+def draw_commands(results: dict[str, Runs], out: Path) -> None:
+    """Draw the share of episodes of Endless Mortar Mayhem in which each seed carries out so many commands, or more."""
+    figure = Figure(figsize=(7, 3), layout="constrained")
+    axis = figure.subplots()
+    for agent in ("GRU", "TrXL+, before", "TrXL+"):
+        for seed, run in enumerate(results["Endless-MortarMayhem-v0"][agent]):
+            scores = tables.final_scores("carried_out", [run])  # (1, M, E)
+            commands = np.arange(scores.max() + 2)
+            shares = (scores.reshape(-1, 1) >= commands).mean(0)
+            axis.step(commands, shares, where="mid", color=COLORS[agent], label=agent if seed == 0 else None)
+    axis.axvline(IN_WINDOW + 0.5, color="gray", linestyle=":", label="window of TrXL+")
+    axis.set(xlabel="commands carried out", ylabel="share of episodes", xlim=(1, 20), xticks=(1, 5, 10, 15, 20), ylim=0)
+    axis.legend(frameon=False)
+    figure.savefig(out, dpi=110)
+
+
 def main(folder: Path = Path("docs")) -> None:
-    """Draw both pictures to a folder."""
+    """Draw the pictures to a folder."""
     results = learning.stored_results(suite="full", agents=AGENTS)
     draw_seeds(results, folder / "seeds.png")
-    draw_endless(with_longer(results), folder / "endless.png")
+    longer = with_longer(results)
+    draw_endless(longer, folder / "endless.png")
+    draw_commands(longer, folder / "commands.png")
 
 
 if __name__ == "__main__":

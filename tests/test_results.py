@@ -21,6 +21,7 @@ import seeds
 import speedrun
 import tables
 import trained_paths
+from memory_gym_envs.players import player
 from ppo_utils import evaluation
 
 ROOT = Path(__file__).parents[1]
@@ -70,9 +71,17 @@ def test_every_seed_is_a_dot(monkeypatch, tmp_path):
     assert len(drawn) == 50
     assert {len(each) for each in drawn} == {0, 3}, "some agents are not trained in all tasks"
     assert max(y for _, y in drawn[9]) == pytest.approx(1, abs=0.02), "TrXL+ in Mortar Mayhem Grid"
-    for name in ("seeds.png", "endless.png"):
+    for name in ("seeds.png", "endless.png", "commands.png"):
         made, shown = (Image.open(folder / name).size for folder in (tmp_path, ROOT / "docs"))
         assert made == shown
+
+
+def test_how_many_commands_a_window_of_256_steps_is_enough_for():
+    """As docs/memory.md says: the tenth is due at step 250, the eleventh, the first of round 5, at step 278."""
+    envs = gym.make_vec("Endless-MortarMayhem-v0", num_envs=2)
+    envs.reset(seed=1)
+    due = [step for step in range(1, 280) if envs.step(player(envs))[1].all()]
+    assert (len(due), *due[-2:]) == (seeds.IN_WINDOW + 1, 250, 278)
 
 
 def test_how_often_a_test_level_s_path_was_trained_on(tiny):
