@@ -231,6 +231,15 @@ STATEMENTS = (
         {"capacity": in_endless(GRU, ("TrXL --trxl-dim 192", "TrXL --trxl-num-layers 3"))},
     ),
     Statement(
+        "7.1.1 A longer window does not help TrXL",
+        "384, 512 steps, as 256",
+        {
+            "window": Claim(
+                "Endless-MortarMayhem-v0-20M", ("TrXL+ --trxl-memory-length 512",), PLUS, expects_difference=False
+            )
+        },
+    ),
+    Statement(
         "7.1.2 Estimating the ground truth helps TrXL",
         "50, 18 commands",
         {"ground-truth": in_endless(("TrXL --ground-truth-coef 0.1",), TRXL)},
