@@ -261,6 +261,7 @@ def test_an_entry_has_its_score_and_minutes(entry, capsys):
     assert capsys.readouterr().out.splitlines()[-1] == row
 
 
+@pytest.mark.filterwarnings("ignore:Precision loss")  # five equal scores
 @pytest.mark.parametrize(
     ("means", "message"),
     [
