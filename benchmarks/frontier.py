@@ -47,7 +47,7 @@ def first_time(steps: np.ndarray, episodes: np.ndarray, commands: int) -> str:
 def draw(every: dict[str, tuple[np.ndarray, np.ndarray]], path: Path) -> None:
     """Draw a map of the shares for each agent: one row per command, one column per evaluation."""
     figure = Figure(figsize=(10, 2.6), layout="constrained")
-    axes = figure.subplots(1, len(every), sharey=True)
+    axes = figure.subplots(1, len(every), sharex=True, sharey=True)
     for axis, (name, (steps, episodes)) in zip(axes, every.items(), strict=True):
         shares = np.where(episodes[:, :-1] >= MIN_EPISODES, episodes[:, 1:] / np.maximum(episodes[:, :-1], 1), np.nan)
         ends = (0, steps[-1] / 1e6, 0.5, COUNT + 0.5)
@@ -56,6 +56,7 @@ def draw(every: dict[str, tuple[np.ndarray, np.ndarray]], path: Path) -> None:
         axis.set_xlabel("million steps")
         axis.set_yticks([1, 5, 10])
     axes[0].set_ylabel("command")
+    axes[0].set_xlim(0, max(steps[-1] for steps, _ in every.values()) / 1e6)
     figure.colorbar(image, label="share of those who come to it", ax=axes)
     figure.savefig(path, dpi=110)
 
