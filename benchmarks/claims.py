@@ -45,8 +45,10 @@ ALL_VISIBLE = {"agent_visible": True, "coins_visible": True, "exit_visible": Tru
 ENDS_SHOWN = {"show_origin": True, "show_goal": True}
 TASKS = {
     **suites.FULL,
-    "Endless-MortarMayhem-v0-20M": replace(suites.FULL["Endless-MortarMayhem-v0"], total_timesteps=20_000_000),
-    "Endless-MysteryPath-v0-9M": replace(suites.FULL["Endless-MysteryPath-v0"], total_timesteps=9_000_000),
+    **{
+        f"{env_id}-{steps // 1_000_000}M": replace(suites.FULL[env_id], total_timesteps=steps)
+        for env_id, steps in suites.LONGER.items()
+    },
     "ends-shown": Task("MysteryPath-Grid-v0", 6_000_000, ENDS_SHOWN, gru_flags=suites.LOW_RATE),
     "all-visible": Task("SearingSpotlights-v0", 2_000_000, ALL_VISIBLE),
     "small-endless": replace(suites.SMALL["endless-mortar-mayhem"], total_timesteps=3_000_000),

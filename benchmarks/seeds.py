@@ -19,10 +19,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of 
 import learning
 import tables
 from ppo_utils.run_logs import Runs, align
-from suites import COLORS, TASKS
+from suites import COLORS, LONGER, TASKS
 
 AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, before", "TrXL+")
-LONGER = {"Endless-MortarMayhem-v0": 20_000_000, "Endless-MysteryPath-v0": 9_000_000}  # steps, if there are such
 IN_WINDOW = 10  # commands of Endless Mortar Mayhem before a window of 256 steps no longer has the first clue
 
 

@@ -97,6 +97,7 @@ FULL = {  # until an agent comes to rest, or as far as is affordable
         ("Endless-SearingSpotlights-v0", 9, ""),
     )
 }
+LONGER = {"Endless-MortarMayhem-v0": 20_000_000, "Endless-MysteryPath-v0": 9_000_000}  # steps of longer trainings
 TASKS = SMALL | FULL
 SUITES = {  # tasks and agents
     "small": (SMALL, ("no memory", "4 frames", "16 frames", "GRU", "TrXL", "TrXL+")),
