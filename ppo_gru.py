@@ -173,15 +173,14 @@ def train(args: Args, run: Run) -> None:
             rollout.advantages = normalize(rollout.advantages)
         step_logs, memory = update(agent, run.optimizers, rollout, ent_coef, args)
         if args.refresh_memory:
-            run.carry.memory = agent.memory.carry(memory)
-        updated = time.perf_counter()
-
+            run.carry.memory = agent.memory.carry(memory)  # the next rollout goes on with what was recomputed
         logs = mean_logs(step_logs, rollout.values, rollout.returns)
+        updated = time.perf_counter()  # numbers were read: now a GPU has done the update, too
+
         del rollout, memory  # before the next one is collected: one at a time is in memory
         logs |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
         run.step = global_step + batch_size
-        times = began, collected, updated
-        end_iteration(args, run, logs, episodes, times)  # evaluation, TensorBoard, progress bar, checkpoint
+        end_iteration(args, run, logs, episodes, (began, collected, updated))  # evaluates, logs, saves
         if run.stop:
             break
 
@@ -258,11 +257,12 @@ def collect(
                 rollout.obs[name][t] = torch.from_numpy(part)
             if ground_truth is not None:
                 rollout.ground_truth[t] = torch.from_numpy(ground_truth)
-            now = {name: part[t] for name, part in rollout.obs.items()}
-            actions, rollout.log_probs[t], rollout.values[t] = agent.get_action_and_value(now, rollout.memory)
+            step_obs = {name: part[t] for name, part in rollout.obs.items()}
+            actions, rollout.log_probs[t], rollout.values[t] = agent.get_action_and_value(step_obs, rollout.memory)
             rollout.actions[t] = actions
 
-            obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
+            with torch.autocast(device.type, enabled=False):  # for environments that compute with torch
+                obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
             done = terminated | truncated
             rollout.rewards[t] = torch.as_tensor(rewards)
             rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
@@ -281,7 +281,7 @@ def collect(
 def update(
     agent: Agent, optimizers: list[torch.optim.Optimizer], rollout: Rollout, ent_coef: float, args: Args
 ) -> tuple[list[dict[str, Tensor]], MemoryState]:
-    """Learn from the rollout for some epochs; return what to log of each minibatch, and the memory's last state."""
+    """Learn from the rollout for some epochs; return what to log of each minibatch, and the memory last recomputed."""
     pieces = agent.memory.cut(rollout.done.cpu())
     step_logs = []
     for epoch in range(args.update_epochs):
@@ -408,8 +408,7 @@ def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tens
     """Return the clipped surrogate loss (2.41) of log_ratio (B, A): its mean over branches (5.4) and samples."""
     ratio = log_ratio.clamp(max=20).exp()  # from 89 on, it would be infinite, and with an advantage of 0 NaN
     advantages = advantages[:, None]
-    clipped = ratio.clamp(1 - clip_coef, 1 + clip_coef)
-    return -torch.minimum(ratio * advantages, clipped * advantages).mean()
+    return -torch.minimum(ratio * advantages, ratio.clamp(1 - clip_coef, 1 + clip_coef) * advantages).mean()
 
 
 def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: float | None) -> Tensor:
@@ -534,7 +533,7 @@ class Memory(nn.Module):
         return args.hidden_size
 
     def initial(self, num_envs: int, device: torch.device) -> dict[str, Tensor]:
-        """Return the memory of fresh episodes: zeros."""
+        """Return the memory of fresh episodes: zeros, (N, P, D)."""
         return {"hidden": torch.zeros(num_envs, self.hidden_vectors, self.width, device=device)}
 
     def carry(self, state: MemoryState) -> dict[str, Tensor]:
@@ -808,6 +807,7 @@ def setup(args: Args) -> Run:
 
 def main(args: Args) -> Path:
     """Train an agent from Python; return the run folder. Raises what `setup` and `run_to_end` raise."""
+    args = replace(args)  # `setup` fills in what is None
     return run_to_end(args, setup(args), train)
 
 

@@ -190,15 +190,14 @@ def train(args: Args, run: Run) -> None:
             rollout.advantages = normalize(rollout.advantages)
         step_logs, memory = update(agent, run.optimizers, rollout, ent_coef, args)
         if args.refresh_memory:
-            run.carry.memory = agent.memory.carry(memory)
-        updated = time.perf_counter()
-
+            run.carry.memory = agent.memory.carry(memory)  # the next rollout goes on with what was recomputed
         logs = mean_logs(step_logs, rollout.values, rollout.returns)
+        updated = time.perf_counter()  # numbers were read: now a GPU has done the update, too
+
         del rollout, memory  # before the next one is collected: one at a time is in memory
         logs |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
         run.step = global_step + batch_size
-        times = began, collected, updated
-        end_iteration(args, run, logs, episodes, times)  # evaluation, TensorBoard, progress bar, checkpoint
+        end_iteration(args, run, logs, episodes, (began, collected, updated))  # evaluates, logs, saves
         if run.stop:
             break
 
@@ -275,11 +274,12 @@ def collect(
                 rollout.obs[name][t] = torch.from_numpy(part)
             if ground_truth is not None:
                 rollout.ground_truth[t] = torch.from_numpy(ground_truth)
-            now = {name: part[t] for name, part in rollout.obs.items()}
-            actions, rollout.log_probs[t], rollout.values[t] = agent.get_action_and_value(now, rollout.memory)
+            step_obs = {name: part[t] for name, part in rollout.obs.items()}
+            actions, rollout.log_probs[t], rollout.values[t] = agent.get_action_and_value(step_obs, rollout.memory)
             rollout.actions[t] = actions
 
-            obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
+            with torch.autocast(device.type, enabled=False):  # for environments that compute with torch
+                obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
             done = terminated | truncated
             rollout.rewards[t] = torch.as_tensor(rewards)
             rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
@@ -298,7 +298,7 @@ def collect(
 def update(
     agent: Agent, optimizers: list[torch.optim.Optimizer], rollout: Rollout, ent_coef: float, args: Args
 ) -> tuple[list[dict[str, Tensor]], MemoryState]:
-    """Learn from the rollout for some epochs; return what to log of each minibatch, and the memory's last state."""
+    """Learn from the rollout for some epochs; return what to log of each minibatch, and the memory last recomputed."""
     pieces = agent.memory.cut(rollout.done.cpu())
     step_logs = []
     for epoch in range(args.update_epochs):
@@ -425,8 +425,7 @@ def policy_loss(log_ratio: Tensor, advantages: Tensor, clip_coef: float) -> Tens
     """Return the clipped surrogate loss (2.41) of log_ratio (B, A): its mean over branches (5.4) and samples."""
     ratio = log_ratio.clamp(max=20).exp()  # from 89 on, it would be infinite, and with an advantage of 0 NaN
     advantages = advantages[:, None]
-    clipped = ratio.clamp(1 - clip_coef, 1 + clip_coef)
-    return -torch.minimum(ratio * advantages, clipped * advantages).mean()
+    return -torch.minimum(ratio * advantages, ratio.clamp(1 - clip_coef, 1 + clip_coef) * advantages).mean()
 
 
 def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip_coef: float | None) -> Tensor:
@@ -549,6 +548,8 @@ class Memory(nn.Module):
             raise ValueError(f"--trxl-dim is {args.trxl_dim}; with --no-embedding it must be {inputs} here")
         if args.trxl_gate_bias and args.trxl_gate == "none":
             raise ValueError("--trxl-gate-bias needs --trxl-gate gru; without, it changes nothing")
+        if args.trxl_memory_gradient and args.trxl_segment_length == 1:
+            raise ValueError("--trxl-memory-gradient needs --trxl-segment-length above 1: a segment's other steps")
         self.width, self.window = args.trxl_dim, args.trxl_memory_length
         self.segment_length, self.memory_gradient = args.trxl_segment_length, args.trxl_memory_gradient
         self.encoding = args.trxl_positional_encoding
@@ -560,7 +561,7 @@ class Memory(nn.Module):
                     nn.init.zeros_(layer.bias)
         if self.encoding == "learned":  # an entry for each of 2,048 steps, and one that all later steps share
             self.table = nn.Parameter(torch.randn(2049, self.width) / math.sqrt(self.width))
-        self.register_buffer("sinusoids", sinusoid(torch.arange(1024), self.width), persistent=False)  # grows if needed
+        self.register_buffer("sinusoids", sinusoid(torch.arange(1024), self.width), persistent=False)
 
     @staticmethod
     def input_width(args: Args) -> int:
@@ -570,9 +571,9 @@ class Memory(nn.Module):
     def initial(self, num_envs: int, device: torch.device) -> dict[str, Tensor]:
         """Return the memory of fresh episodes: a window with no step to attend to."""
         return {
-            "hidden": torch.zeros(self.window, num_envs, len(self.blocks), self.width, device=device),
-            "row_step": torch.zeros(self.window, num_envs, dtype=torch.int64),
-            "episode_step": torch.zeros(num_envs, dtype=torch.int64),
+            "hidden": torch.zeros(self.window, num_envs, len(self.blocks), self.width, device=device),  # (W, N, K, D)
+            "row_step": torch.zeros(self.window, num_envs, dtype=torch.int64),  # (W, N)
+            "episode_step": torch.zeros(num_envs, dtype=torch.int64),  # (N,)
         }
 
     def carry(self, state: MemoryState) -> dict[str, Tensor]:
@@ -647,8 +648,8 @@ class Memory(nn.Module):
         with gradient (Dai et al., 2019): the same numbers, as long as the weights are those that acted.
         """
         t, env = pieces.first[:, None] // pieces.num_envs, pieces.first[:, None] % pieces.num_envs  # (S, 1) each
-        episode_step = state.row_step[self.window :].flatten()[pieces.flat_index()]  # (B,)
-        episode_step = pieces.pad(episode_step)  # (S, L); padding is step 0, which attends to nothing
+        # (S, L); padding is step 0, which attends to nothing
+        episode_step = pieces.pad(state.row_step[self.window :].flatten()[pieces.flat_index()])
         key_columns, age, mask = attended_keys(episode_step, self.window, x.device)  # (M,), (L, M), (S, L, M)
         rows = (self.window + t + key_columns).clamp(max=len(state.row_step) - 1)  # (S, M); padding may be beyond
         attended = mask.any(1)[..., None]  # (S, M, 1)
@@ -669,8 +670,8 @@ class Memory(nn.Module):
         """Encode steps of episodes (...), on the CPU, by the learned table, or as sines and cosines: (..., D)."""
         if self.encoding == "learned":
             return self.table[episode_step.clamp(max=len(self.table) - 1).to(like.device)]
-        if (last := int(episode_step.max())) >= len(self.sinusoids):
-            self.sinusoids = sinusoid(torch.arange(2 * last), self.width).to(like.device)
+        if int(episode_step.max()) >= len(self.sinusoids):  # a table would grow with the episode
+            return sinusoid(episode_step.to(like.device), self.width).to(like.dtype)
         return self.sinusoids[episode_step.to(like.device)].to(like.dtype)
 
     def position(self, episode_step: Tensor, like: Tensor) -> Tensor | float:
@@ -702,7 +703,7 @@ def attended_keys(episode_step: Tensor, window: int, device: torch.device) -> tu
 
 
 def attention_mask(age: Tensor, episode_step: Tensor, window: int) -> Tensor:
-    """Return whether a query at this step of its episode attends to a key that is `age` steps older."""
+    """Return whether queries at these steps of their episodes (S, L, 1) attend to keys that are age (L, M) older."""
     return (age >= 1) & (age <= episode_step) & (age <= window)
 
 
@@ -730,7 +731,7 @@ class Block(nn.Module):
         gated = args.trxl_gate == "gru"  # else, residual connections
         self.merge_attention = Gate(width, args.trxl_gate_bias) if gated else torch.add
         self.merge_projection = Gate(width, args.trxl_gate_bias) if gated else torch.add
-        self.query_position = is_first and args.trxl_query_position
+        self.adds_position = is_first and args.trxl_query_position
 
     def keys_values(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
         """Project hidden states (..., D), to which their positions are added already, to keys and values."""
@@ -739,7 +740,7 @@ class Block(nn.Module):
 
     def forward(self, x: Tensor, position: Tensor, keys: Tensor, values: Tensor, age: Tensor, mask: Tensor) -> Tensor:
         """Map x (S, L, D) to the next block's input; position (S, L, D): what --trxl-query-position adds to queries."""
-        query = self.norm_query(x + position if self.query_position else x)
+        query = self.norm_query(x + position if self.adds_position else x)
         x = self.after_attention(self.merge_attention(x, self.attention(query, keys, values, age, mask)))
         x = self.merge_projection(x, F.relu(self.projection(self.norm_projection(x))))
         return self.after_projection(x)
@@ -1028,6 +1029,7 @@ def setup(args: Args) -> Run:
 
 def main(args: Args) -> Path:
     """Train an agent from Python; return the run folder. Raises what `setup` and `run_to_end` raise."""
+    args = replace(args)  # `setup` fills in what is None
     return run_to_end(args, setup(args), train)
 
 

@@ -123,7 +123,8 @@ def evaluate(
         for t in range(max_steps):
             memory = with_room(agent.memory, memory, t)
             actions, *_ = agent.get_action_and_value(as_tensors(obs, device), memory, deterministic)
-            obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
+            with torch.autocast(device.type, enabled=False):  # for environments that compute with torch
+                obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
             done = terminated | truncated
             agent.memory.reset(memory, torch.as_tensor(done))
             metrics["return"] += rewards * playing

@@ -72,7 +72,8 @@ class RunArgs:
     """What a script's Args begins with: flags of the run, its environments and evaluations, which it does not read.
 
     Those of the algorithm follow in the script. Of these, this package reads total_timesteps, num_envs, num_steps,
-    num_minibatches, update_epochs, refresh_memory, anneal_steps, amp and the coefficients of auxiliary losses.
+    num_minibatches, update_epochs, refresh_memory, anneal_steps, amp, and the coefficients of auxiliary losses with
+    auxiliary_detach.
     """
 
     exp_name: str = ""

@@ -98,6 +98,10 @@ def prepare(args: RunArgs, script: str) -> tuple[Run, dict[str, np.ndarray], dic
     device = torch.device("cpu")
     if torch.cuda.is_available() and args.cuda:
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+        if device.index >= (gpus := torch.cuda.device_count()):
+            raise ValueError(
+                f"there are more processes than GPUs on this machine; start at most {gpus}, or use --no-cuda"
+            )
         torch.set_float32_matmul_precision("high")  # TF32
     with report_out_of_memory(args, device):
         envs = training_envs(args, checkpoint)

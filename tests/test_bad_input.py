@@ -72,6 +72,7 @@ TRANSFORMER_CASES = {
     "--trxl-dim 9 --trxl-num-heads 3": "--trxl-dim is 9; it must be even",
     "--trxl-memory-length 0": "--trxl-memory-length is 0; it must be 1 or more",
     "--trxl-gate-bias inf": "--trxl-gate-bias is inf; it must be -100 to 100",
+    "--trxl-memory-gradient --trxl-segment-length 1": "--trxl-memory-gradient needs --trxl-segment-length above 1",
     "--trxl-gate-bias 2": "--trxl-gate-bias needs --trxl-gate gru; without, it changes nothing",
     "--num-minibatches 200": "may have only 128 sequences .* at most that many, or more environments",
 }
@@ -100,6 +101,14 @@ def opened_weights(script, args):
 def test_setup_names_the_fault(line):
     message = setup_error(parse_args(ppo_gru, *line.split()))
     assert re.search(CASES[line], message), message
+
+
+def test_a_process_without_a_gpu_of_its_own(monkeypatch, tiny):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    said = setup_error(tiny(cuda=True))
+    assert said == "there are more processes than GPUs on this machine; start at most 1, or use --no-cuda"
 
 
 @pytest.mark.parametrize("line", TRANSFORMER_CASES)

@@ -241,16 +241,19 @@ def test_a_long_episode_takes_no_more_memory_than_a_short_one(played):
     assert run.rollout.memory.hidden.shape == (1, 1, 4)
 
 
-def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(played):
+@pytest.mark.parametrize("encoding", ["absolute", "relative", "learned", "none"])
+def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(played, encoding):
     """5,000 steps of one endless episode, far beyond the window and the encodings' usual length."""
     changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"explosion_delay": [1000]}'}
+    changes |= {"trxl_positional_encoding": encoding, "trxl_query_position": True}
     args, run, *_ = played(script=ppo_trxl, num_envs=1, num_steps=50, num_minibatches=1, **changes)
     # As if the episode had been going on for long; its window is still that of 50 steps.
     run.carry.memory["episode_step"] += 4900
 
     def storage():
-        state = run.rollout.memory
-        return [part.shape for part in (*state.keys, *state.values, state.hidden, state.row_step)]
+        state, memory = run.rollout.memory, run.agent.memory
+        parts = (*state.keys, *state.values, state.hidden, state.row_step, *memory.buffers(), *memory.parameters())
+        return [part.shape for part in parts]
 
     before = storage()
     for _ in range(3):

@@ -8,6 +8,7 @@ import random
 import re
 import subprocess
 import sys
+import time
 import traceback
 import types
 from concurrent.futures import ThreadPoolExecutor
@@ -328,6 +329,46 @@ def test_seconds_of_an_iteration_are_those_of_its_parts(tiny, scalars):
     parts = np.add(found["charts/seconds_collect"], found["charts/seconds_update"])
     assert parts == pytest.approx(found["charts/seconds_iteration"], rel=1e-4)
     assert found["charts/SPS"] == pytest.approx(np.array([64, 128]) / np.cumsum(parts), rel=1e-4), "since it began"
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_an_update_takes_until_its_numbers_are_read(tiny, scalars, monkeypatch, script):
+    """As on a GPU, where reading them waits for the work that was queued."""
+    mean_logs = script.mean_logs
+    monkeypatch.setattr(script, "mean_logs", lambda *args: time.sleep(0.5) or mean_logs(*args))
+    assert min(scalars(script.main(tiny(script, env_id="CueRecall-v0")))["charts/seconds_update"]) >= 0.5
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_arguments_stay_as_they_were(tiny, script):
+    """What is None is filled in for one training, not for the next one of a longer sweep."""
+    args = tiny(script, env_id="CueRecall-v0", anneal_steps=None)
+    before = dataclasses.replace(args)
+    script.main(args)
+    assert args == before
+
+
+class Product(gym.Env):
+    """An environment that computes with torch: its reward is a product of matrices."""
+
+    observation_space, action_space = gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(2)
+    factor = torch.full((1, 3), 1.001)
+    reward = float(factor @ factor.T)
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), float(self.factor @ self.factor.T), True, False, {}
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_precision_of_agents_is_not_that_of_environments(tiny, scalars, script):
+    gym.register("Product-v0", entry_point=Product)
+    found = scalars(script.main(tiny(script, env_id="Product-v0", amp=True, eval_interval=1, eval_levels=1)))
+    del gym.registry["Product-v0"]
+    assert {*found["charts/episodic_return"]} | {*found["eval/return"]} == {np.float32(Product.reward)}
 
 
 def test_annealing(tiny, scalars):

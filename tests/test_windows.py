@@ -99,7 +99,7 @@ def naive(memory, x, row, lane, stored, own=None):
     window = min(step, memory.window)
     at = torch.arange(row - window, row)
     added = torch.zeros_like(x)
-    if memory.blocks[0].query_position:
+    if memory.blocks[0].adds_position:
         added = added + encoded(memory, step)
     inputs = []
     for k, block in enumerate(memory.blocks):
@@ -399,7 +399,7 @@ def test_episodes_longer_than_a_learned_encoding(encoding):
     if encoding == "learned":
         assert at.equal(memory.table[[4, 5, 6, 6, 6]])
     elif encoding == "absolute":
-        assert at.equal(sinusoid(torch.tensor([4, 5, 6, 7, 5000]), WIDTH)), "the table of sinusoids grows"
+        assert at.equal(sinusoid(torch.tensor([4, 5, 6, 7, 5000]), WIDTH)), "beyond the table"
     state = fresh(memory, 1)
     with torch.no_grad():
         for _ in range(9):
@@ -407,7 +407,7 @@ def test_episodes_longer_than_a_learned_encoding(encoding):
 
 
 @pytest.mark.parametrize("step", [0, 1023, 1024, 1025, 5000])
-def test_the_table_of_sinusoids_grows_to_the_steps_that_are_met(step):
+def test_steps_beyond_the_table_of_sinusoids_are_encoded_alike(step):
     memory = make_memory()
     for step_now in (step, step + 1):  # an episode goes on
         at = memory.position(torch.tensor([step_now]), torch.zeros((), dtype=torch.float64))
