@@ -4,7 +4,7 @@
 
 docs/seeds.png has a panel for each task and a dot for each seed: the score of the final weights on new test levels.
 docs/endless.png has the curves of endless tasks on development levels, with steps on a logarithmic axis up to the
-thesis', docs/commands.png after how many commands episodes of Endless Mortar Mayhem end.
+thesis', docs/commands.png after how many commands episodes of Endless Mortar Mayhem end, which a table says, too.
 """
 
 import sys
@@ -22,6 +22,7 @@ from ppo_utils.run_logs import Runs, align
 from suites import COLORS, LONGER, TASKS
 
 AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, before", "TrXL+")
+LONG_AGENTS = ("GRU", "GRU --num-envs 32 --num-steps 512", "TrXL+, before", "TrXL+")  # of the last picture
 IN_WINDOW = 10  # commands of Endless Mortar Mayhem before a window of 256 steps no longer has the first clue
 
 
@@ -80,16 +81,27 @@ def draw_endless(results: dict[str, Runs], out: Path) -> None:
     figure.savefig(out, dpi=110)
 
 
-def draw_commands(results: dict[str, Runs], out: Path) -> None:
-    """Draw the share of episodes of Endless Mortar Mayhem in which each seed carries out so many commands, or more."""
+def draw_commands(out: Path) -> None:
+    """Draw the share of episodes of Endless Mortar Mayhem in which each seed carries out so many commands, or more.
+
+    Print a table of after how many they end, in percent, all seeds of an agent together.
+    """
+    task = "Endless-MortarMayhem-v0"
+    (agents,) = learning.stored_results(tasks=(task,), steps=LONGER[task], agents=LONG_AGENTS).values()
     figure = Figure(figsize=(7, 3), layout="constrained")
     axis = figure.subplots()
-    for agent in ("GRU", "TrXL+, before", "TrXL+"):
-        for seed, run in enumerate(results["Endless-MortarMayhem-v0"][agent]):
+    ends = range(4, IN_WINDOW + 1)
+    print(f"| % of episodes that end after | {' | '.join(map(str, ends))} | more |\n|---|{(len(ends) + 1) * '---:|'}")
+    for agent, runs in agents.items():
+        style = {"color": COLORS.get(agent, COLORS["GRU"]), "linestyle": "-" if agent in COLORS else "--"}
+        for seed, run in enumerate(runs):
             scores = tables.final_scores("carried_out", [run])  # (1, M, E)
             commands = np.arange(scores.max() + 2)
             shares = (scores.reshape(-1, 1) >= commands).mean(0)
-            axis.step(commands, shares, where="mid", color=COLORS[agent], label=agent if seed == 0 else None)
+            axis.step(commands, shares, where="mid", label=agent if seed == 0 else None, **style)
+        every = tables.final_scores("carried_out", runs)
+        cells = [(every == end).mean() for end in ends] + [(every > IN_WINDOW).mean()]
+        print(f"| {agent} | {' | '.join(f'{100 * share:.0f}' for share in cells)} |")
     axis.axvline(IN_WINDOW + 0.5, color="gray", linestyle=":", label="window of TrXL+")
     axis.set(xlabel="commands carried out", ylabel="share of episodes", xlim=(1, 20), xticks=(1, 5, 10, 15, 20), ylim=0)
     axis.legend(frameon=False)
@@ -97,12 +109,11 @@ def draw_commands(results: dict[str, Runs], out: Path) -> None:
 
 
 def main(folder: Path = Path("docs")) -> None:
-    """Draw the pictures to a folder."""
+    """Draw the pictures to a folder, and print the table."""
     results = learning.stored_results(suite="full", agents=AGENTS)
     draw_seeds(results, folder / "seeds.png")
-    longer = with_longer(results)
-    draw_endless(longer, folder / "endless.png")
-    draw_commands(longer, folder / "commands.png")
+    draw_endless(with_longer(results), folder / "endless.png")
+    draw_commands(folder / "commands.png")
 
 
 if __name__ == "__main__":

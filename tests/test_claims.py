@@ -150,7 +150,7 @@ def test_agents_of_a_comparison_of_equals_have_equal_settings():
     """Of those that the preset sets apart, and of those that Mystery Path has for the GRU."""
     names = ("init_lr", "gamma", "vf_coef", "clip_coef", "norm_reward", "exploration_bonus", "init_ent_coef")
     same = [claim for name, claim in claims.CLAIMS.items() if name.startswith("same-")]
-    assert len(same) == 10
+    assert len(same) == 11
     for claim in same:
         plans = [claim.plans(claims.Config(seeds=(1,)), agent)[0] for agent in claim.agents]
         assert plans[0].args.__class__ is not plans[1].args.__class__
@@ -168,6 +168,21 @@ def test_test_levels_decide():
     claim = claims.CLAIMS["score-Endless-MortarMayhem-v0"]
     assert claims.judge(claim, {"GRU": runs(7.0), "TrXL+": runs(6.0)}, []).text == "holds"
     assert claims.judge(claim, {"GRU": runs(6.0), "TrXL+": runs(6.0)}, []).text == "not decided"
+
+
+def test_so_many_times_as_high():
+    """Twelve times as high as the other, not eleven, without noise."""
+    claim = claims.CLAIMS["normalized-gradients"]
+
+    def runs(norm):
+        curves = {"losses/grad_norm": (np.array([100]), np.full((1, 1, 1), norm))}
+        return RunLog("", {}, curves | {"eval/success": (np.array([100]), np.full((1, 4, 1), 1.0))})
+
+    for factor, text in ((11, "does not hold"), (13, "holds")):
+        found = {
+            agent: [runs(norm), runs(1.01 * norm)] for agent, norm in zip(claim.agents, (factor, 1.0), strict=True)
+        }
+        assert claims.judge(claim, found, []).text == text
 
 
 def test_short_names():
@@ -216,7 +231,7 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
         norms = [run.curves["losses/grad_norm"][1].mean() for run in runs]
         cells.append(tables.mean_and_error(np.reshape(norms, (2, 1, 1))).replace(" ", ""))
     (row,) = (line for line in told.splitlines() if line.endswith(" | `normalized-gradients` (`--target-kl None`) |"))
-    start = "| 7.2 Normalized advantages make gradients larger | over 12 times"
+    start = "| 7.2 Normalized advantages make gradients over 12 times larger | 0.38, 0.02"
     assert row.startswith(f"{start} | GRU, norm adv minibatch: {cells[1]} | GRU: {cells[0]} | ")
     assert told.splitlines()[-1].startswith("Of 1 rows: 1 ")
     claims.main(config)
@@ -269,12 +284,25 @@ def test_rows_of_one_statement(monkeypatch, capsys):
     ]
 
 
+def test_statements_hold_in_all_or_some_of_their_rows(monkeypatch, capsys):
+    curve = np.array([100]), np.full((1, 4, 1), 0.5)
+    run = RunLog("", {"total_timesteps": 3e6}, {"eval/success": curve, "eval/carried_out": curve})
+    monkeypatch.setattr(learning, "result_of", lambda config, plan: run)
+    on_grid = {True: claims.Verdict("holds", 0.01), False: claims.Verdict("not decided")}
+    monkeypatch.setattr(claims, "judge", lambda claim, *_: on_grid["Grid" in claim.task])
+    tasks = ("MortarMayhem-v0", "MortarMayhem-Grid-v0", "MysteryPath-Grid-v0", "SearingSpotlights-v0")
+    claims.main(claims.Config(claims=tuple(f"memory-{task}" for task in tasks), report=True))
+    statements = capsys.readouterr().out.splitlines()[-2]
+    assert statements == "Of 3 statements tested, so many hold in their rows: 1 in all, 1 in some, 1 in none."
+
+
 def test_statements_without_runs_have_a_row(monkeypatch, capsys):
     monkeypatch.setattr(learning, "result_of", lambda config, plan: None)
     claims.main(claims.Config(report=True))
-    _, head, _, *rows, _, summary = capsys.readouterr().out.splitlines()
+    _, head, _, *rows, _, statements, summary = capsys.readouterr().out.splitlines()
     assert head == "| not run | thesis | `--claims` |"
     assert len(rows) == len(claims.STATEMENTS)
+    assert statements == "Of 0 statements tested, so many hold in their rows: 0 in all, 0 in some, 0 in none."
     assert rows[0].endswith("|  | `memory-MortarMayhem-Grid-v0`, `memory-MortarMayhem-v0` |")
     assert rows[-1].startswith("| 7.2 In BossFight,")
     count = len(claims.CLAIMS) + sum(not statement.claims for statement in claims.STATEMENTS)

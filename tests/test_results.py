@@ -9,6 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 import tyro
 from matplotlib.axes import Axes
 from PIL import Image
@@ -21,8 +22,9 @@ import seeds
 import speedrun
 import tables
 import trained_paths
+import trials
 from memory_gym_envs.players import player
-from ppo_utils import evaluation
+from ppo_utils import evaluation, runs
 
 ROOT = Path(__file__).parents[1]
 
@@ -43,9 +45,12 @@ def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_pa
     fence = re.compile(r"^```\n(.*?)^```\n", re.MULTILINE | re.DOTALL)
     printed, rows = "", 0
     for section in re.split("^##+ ", page, flags=re.MULTILINE):
-        for call in " ".join(fence.findall(section.replace("\\\n", " "))).split("python benchmarks/learning.py")[1:]:
-            config = tyro.cli(learning.Config, args=shlex.split(call))
-            learning.main(replace(config, report=True, out=tmp_path / "curves.png"))
+        for line in "".join(fence.findall(section.replace("\\\n", " "))).splitlines():
+            if line.startswith("python benchmarks/learning.py"):
+                config = tyro.cli(learning.Config, args=shlex.split(line)[2:])
+                learning.main(replace(config, report=True, out=tmp_path / "curves.png"))
+        if "python benchmarks/seeds.py" in section:
+            seeds.main(tmp_path)
         if "python benchmarks/trained_paths.py" in section:
             trained_paths.main(trained_paths.Config(out=tmp_path / "paths.png"))
         here = capsys.readouterr().out
@@ -104,6 +109,26 @@ def test_how_often_a_test_level_s_path_was_trained_on(tiny):
 def test_the_table_of_the_fastest_is_printed_by_its_command(capsys):
     speedrun.main()
     assert capsys.readouterr().out in (ROOT / "docs/tuning.md").read_text()
+
+
+def test_trials_are_printed_and_added(tiny, tmp_path, monkeypatch, capsys):
+    """Scores of a run's last evaluation until then; columns that not all seeds came to are empty."""
+    trials.main(trials.Config())
+    assert capsys.readouterr().out in (ROOT / "docs/tuning.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(trials, "TRIALS", tmp_path / "trials.csv")
+    monkeypatch.setattr(trials, "COLUMNS", {"MysteryPath-Grid-v0": ((6.4e-5, 1e-4, 1.28e-4, 2e-4), ())})
+    trials.TRIALS.write_text("task,agent,seed,step,score\nMysteryPath-Grid-v0,other,1,100,0.5\n")
+    scores = [dict.fromkeys(("success", "return"), np.full((2, 1), score)) for score in (0.25, 0.75, 0.5, 1.0)]
+    monkeypatch.setattr(runs, "level_scores", lambda *_: {k: torch.tensor(v) for k, v in scores.pop(0).items()})
+    args = {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "eval_interval": 1}
+    for seed in (1, 2):
+        trials.main(trials.Config(add=("new", ppo_gru.main(tiny(seed=seed, **args)))))
+    trials.main(trials.Config())
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        "| `other` | 1 |  | 0.50 |  |  |",
+        "| `new` | 2 | 0.38 | 0.38 | 0.88 |  |",
+    ]
 
 
 def test_the_frontier_is_printed_and_drawn(capsys, tmp_path):

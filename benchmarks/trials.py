@@ -1,0 +1,98 @@
+"""Settings that were tried beside the preset's: the table of docs/tuning.md.
+
+    python benchmarks/trials.py
+    python benchmarks/trials.py --add "TrXL+ --final-lr 1e-5" runs/RUN
+
+Scores on development levels while the learning rate falls as in a whole training, most of it ahead. Of a trial, only
+this curve is kept, in benchmarks/trials.csv, to which --add writes that of a run's folder; whole trainings beside them
+are in benchmarks/results.
+"""
+
+import csv
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
+
+import learning
+from ppo_utils.run_logs import RunLog, read_run
+from suites import TASKS
+
+TRIALS = Path(__file__).with_name("trials.csv")
+COLUMNS = {  # million steps of each task's columns, and the whole trainings that stand above its trials
+    "MortarMayhem-Grid-v0": ((1.2, 1.8, 2.4, 3), ("TrXL+", "TrXL+, before", "GRU")),
+    "MortarMayhem-v0": ((1.2, 2.4, 3.6, 6), ("TrXL+", "TrXL+, before", "GRU")),
+    "MysteryPath-Grid-v0": ((2.4, 3, 4.8, 6, 9), ("TrXL+", "TrXL+, low rate", "GRU")),
+    "SearingSpotlights-v0": ((1.2, 1.8, 2.4, 3), ("TrXL+", "TrXL+, before", "GRU")),
+}
+Curve = dict[int, float]  # mean scores by steps
+
+
+@dataclass
+class Config:
+    """What to add; without it, the table is printed."""
+
+    add: tuple[str, Path] | None = None
+    """an agent, as benchmarks/learning.py names it, and the folder of its run"""
+
+
+def curve_of(run: RunLog) -> Curve:
+    """Return a run's mean scores on development levels."""
+    steps, scores = run.curves[f"eval/{TASKS[run.args['env_id']].score}"]
+    return dict(zip(steps.tolist(), scores.mean((1, 2)).tolist(), strict=True))
+
+
+def add(agent: str, run: RunLog) -> None:
+    """Append a run's curve to the file."""
+    whose = run.args["env_id"], agent, run.args["seed"]
+    with TRIALS.open("a", newline="") as file:
+        rows = ((*whose, step, f"{score:.4f}") for step, score in curve_of(run).items())
+        csv.writer(file, lineterminator="\n").writerows(rows)
+
+
+def read_trials(task: str) -> dict[str, list[Curve]]:
+    """Read the curves of a task's trials: one for each seed of an agent, in the order of the file."""
+    curves = defaultdict(dict)
+    with TRIALS.open(newline="") as file:
+        for row in csv.DictReader(file):
+            if row["task"] == task:
+                seeds = curves[row["agent"]]
+                seeds.setdefault(row["seed"], {})[int(row["step"])] = float(row["score"])
+    return {agent: [*seeds.values()] for agent, seeds in curves.items()}
+
+
+def score_at(curve: Curve, millions: float) -> float:
+    """Return the score of the last evaluation until then; NaN if there is none, or if the run had ended."""
+    scores = [score for step, score in curve.items() if step <= 1e6 * millions]
+    return scores[-1] if scores and max(curve) > 0.95e6 * millions else np.nan
+
+
+def row(agent: str, curves: list[Curve], columns: tuple[float, ...]) -> str:
+    """Return an agent's row: how many seeds, and their means at each of the columns that all of them came to."""
+    means = [np.mean([score_at(curve, millions) for curve in curves]) for millions in columns]
+    cells = ["" if np.isnan(mean) else f"{mean:.2f}" for mean in means]
+    return f"| {' | '.join([f'`{agent}`', str(len(curves)), *cells])} |"
+
+
+def main(config: Config) -> None:
+    """Print the tables, or add a run. Raises NoCurvesError for a folder that holds none."""
+    if config.add:
+        agent, folder = config.add
+        add(agent, read_run(str(folder)))
+        return
+    for task, (columns, agents) in COLUMNS.items():
+        print(f"\n| {task} | seeds | {' | '.join(f'{millions:g} M' for millions in columns)} |")
+        print(f"|---|{'---:|' * (1 + len(columns))}")
+        stored = learning.stored_results(tasks=(task,), agents=agents)[task]
+        whole = {agent: [*map(curve_of, runs)] for agent, runs in stored.items()}
+        for agent, curves in (whole | read_trials(task)).items():
+            print(row(agent, curves, columns))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
