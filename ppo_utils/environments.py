@@ -57,7 +57,13 @@ def training_envs(args: RunArgs, checkpoint: dict[str, Any] | None) -> VectorEnv
     # Environments that cannot be restored must not repeat the episodes that the run began with.
     seed = args.seed if checkpoint is None else [args.seed, checkpoint["step"]]
     mode = "debug_rgb_array" if args.capture_video else None
-    return envs_for(args, share, seed=seed, first_lane=rank * share, render_mode=mode)
+    try:
+        return envs_for(args, share, seed=seed, first_lane=rank * share, render_mode=mode)
+    except ValueError as error:
+        if args.preset != "quickstart":
+            raise
+        own = f"--preset quickstart has --env-options '{args.env_options}', give other ones: '{{}}' for the default"
+        raise ValueError(f"{error}; {own}") from None
 
 
 def as_tensors(obs: dict[str, np.ndarray], device: torch.device) -> dict[str, Tensor]:

@@ -61,6 +61,8 @@ CASES = {
     "memory",
     "--memory none --seq-len 5": "--seq-len, --num-layers and --refresh-memory need --memory gru or lstm",
     "--memory none --refresh-memory": "--refresh-memory need --memory gru or lstm",
+    "--preset quickstart --env-id MysteryPath-Grid-v0": "has no option .*quickstart has --env-options '{.*'{}' for the",
+    "--preset quickstart --env-id CartPole-v1": "CartPole-v1 has none .*quickstart has --env-options",
     "--env-id .foo:x-v0": "the module of .foo:x-v0 begins with a dot",
     "--capture-video --load-model missing.pt": "there is no file missing.pt",
     "--load-model missing.pt": "there is no file missing.pt; --save-model writes model.pt",
