@@ -458,6 +458,37 @@ def finished(config: Config, plans: list[learning.Plan], results: dict) -> list[
     return [results[plan.command] for plan in plans if results[plan.command] is not None]
 
 
+def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, Verdict]) -> None:
+    """Print a row for each claim with a verdict, then one for each statement that was not run, and how many there are.
+
+    runs: of each claim that was asked for, by its agents.
+    """
+    stars = dict(zip(verdicts, holm([each.p_value for each in verdicts.values()]), strict=True))
+    counts = Counter(found.text for found in verdicts.values())
+    tested, not_run, holding = [HEADING], [NOT_RUN], []
+    for statement in STATEMENTS:
+        said = statement.text, statement.thesis  # once, above rows that say the same of other tasks
+        names = [name for name in statement.claims if name in verdicts]
+        for name in names:
+            tested.append(row(name, runs[name], str(verdicts[name]) + " \\*" * stars[name], said))
+            said = "", ""
+        if names:
+            held = [verdicts[name].text in ("holds", "not contradicted") for name in names]
+            holding.append("all" if all(held) else "some" if any(held) else "none")
+        lacking = [f"`{name}`" for name in statement.claims if name in runs and name not in verdicts]
+        # What no claim was made of has a row all the same, unless only some claims were asked for.
+        if lacking or (not statement.claims and runs.keys() == CLAIMS.keys()):
+            not_run.append(f"| {' | '.join([statement.text, statement.thesis, ', '.join(lacking)])} |")
+            counts["not run"] += len(lacking) or 1
+    for table in (tested, not_run):
+        if table[1:]:
+            print("\n".join(table))
+    summary = ", ".join(f"{count} {text}" for text, count in counts.most_common())
+    shares = ", ".join(f"{holding.count(share)} in {share}" for share in ("all", "some", "none"))
+    print(f"\nOf {len(holding)} statements tested, so many hold in their rows: {shares}.")
+    print(f"Of {counts.total()} rows: {summary}. With a star: {sum(stars.values())}.")
+
+
 def main(config: Config) -> None:
     """Train what is missing, then print a row for each claim. Raises SystemExit for names that are not in CLAIMS.
 
@@ -480,30 +511,7 @@ def main(config: Config) -> None:
         seeds = [learning.plan(config, TASKS[claim.task], "no memory", seed) for seed in config.seeds]
         without = finished(config, seeds, results)
         verdicts[name] = judge(claim, runs[name], without if len(without) == len(seeds) else [])
-    stars = dict(zip(verdicts, holm([each.p_value for each in verdicts.values()]), strict=True))
-    counts = Counter(found.text for found in verdicts.values())
-    tested, not_run, holding = [HEADING], [NOT_RUN], []
-    for statement in STATEMENTS:
-        said = statement.text, statement.thesis  # once, above rows that say the same of other tasks
-        for name in (name for name in statement.claims if name in verdicts):
-            tested.append(row(name, runs[name], str(verdicts[name]) + " \\*" * stars[name], said))
-            said = "", ""
-        if found := [
-            verdicts[name].text in ("holds", "not contradicted") for name in statement.claims if name in verdicts
-        ]:
-            holding.append("all" if all(found) else "some" if any(found) else "none")
-        lacking = [f"`{name}`" for name in statement.claims if name in claims and name not in verdicts]
-        # What no claim was made of has a row all the same, unless only some claims were asked for.
-        if lacking or (not statement.claims and claims == CLAIMS):
-            not_run.append(f"| {' | '.join([statement.text, statement.thesis, ', '.join(lacking)])} |")
-            counts["not run"] += len(lacking) or 1
-    for table in (tested, not_run):
-        if table[1:]:
-            print("\n".join(table))
-    summary = ", ".join(f"{count} {text}" for text, count in counts.most_common())
-    shares = ", ".join(f"{holding.count(share)} in {share}" for share in ("all", "some", "none"))
-    print(f"\nOf {len(holding)} statements tested, so many hold in their rows: {shares}.")
-    print(f"Of {counts.total()} rows: {summary}. With a star: {sum(stars.values())}.")
+    print_tables(runs, verdicts)
 
 
 if __name__ == "__main__":

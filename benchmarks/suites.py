@@ -97,7 +97,12 @@ FULL = {  # until an agent comes to rest, or as far as is affordable
         ("Endless-SearingSpotlights-v0", 9, ""),
     )
 }
-LONGER = {"Endless-MortarMayhem-v0": 20_000_000, "Endless-MysteryPath-v0": 9_000_000}  # steps of longer trainings
+LONGER = {  # steps of longer trainings
+    "MortarMayhemB-v0": 12_000_000,
+    "Endless-MortarMayhem-v0": 20_000_000,
+    "MysteryPath-v0": 24_000_000,
+    "Endless-MysteryPath-v0": 9_000_000,
+}
 TASKS = SMALL | FULL
 SUITES = {  # tasks and agents
     "small": (SMALL, ("no memory", "4 frames", "16 frames", "GRU", "TrXL", "TrXL+")),

@@ -153,20 +153,8 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         changed = {"render_fps": self.variant.render_fps, "autoreset_mode": self.autoreset_mode}
         self.metadata = {**type(self).metadata, **changed}
         self.obs_type = obs_type
-        self.single_observation_space, self.single_action_space = self.spaces()
-        if obs_type == "vector":
-            self.single_observation_space = vector_space(self.variant.entries)
-        elif obs_type == "grayscale":
-            self.single_observation_space = grayscale_space(self.single_observation_space)
         self.joined: tuple[int, ...] | None = None  # the sizes of the branches that one number stands for
-        if action_type == "discrete" and isinstance(self.single_action_space, MultiDiscrete):
-            self.joined = tuple(self.single_action_space.nvec.tolist())
-            self.single_action_space = Discrete(math.prod(self.joined))
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._action_shape = (self.num_envs, *(self.single_action_space.shape or ()))
-        space: Any = self.single_action_space
-        self._choices = np.array(space.nvec if hasattr(space, "nvec") else space.n, np.uint64)  # of each branch
+        self._make_spaces(action_type)
         self._rngs: list[Any] = [None] * self.num_envs  # generators, from the first reset on
         self._level_rngs: list[Any] = [None] * self.num_envs  # likewise, with num_levels
         self._seeds: list[int | None] = [None] * self.num_envs
@@ -182,6 +170,22 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         self._over = np.zeros(self.num_envs, bool)  # lanes that wait for a reset; in the same-step mode, none does
         self.allocate()
         self.place_tables()
+
+    def _make_spaces(self, action_type: str) -> None:
+        """Make the spaces of one lane and of all, as obs_type and action_type change those of the family."""
+        self.single_observation_space, self.single_action_space = self.spaces()
+        if self.obs_type == "vector":
+            self.single_observation_space = vector_space(self.variant.entries)
+        elif self.obs_type == "grayscale":
+            self.single_observation_space = grayscale_space(self.single_observation_space)
+        if action_type == "discrete" and isinstance(self.single_action_space, MultiDiscrete):
+            self.joined = tuple(self.single_action_space.nvec.tolist())
+            self.single_action_space = Discrete(math.prod(self.joined))
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._action_shape = (self.num_envs, *(self.single_action_space.shape or ()))
+        space: Any = self.single_action_space
+        self._choices = np.array(space.nvec if hasattr(space, "nvec") else space.n, np.uint64)  # of each branch
 
     # ---- what a family provides ----
 
