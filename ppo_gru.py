@@ -398,7 +398,7 @@ def gae(rewards: Tensor, rollout: Rollout, gamma: float, gae_lambda: float) -> T
 
 
 def normalize(x: Tensor) -> Tensor:
-    """Return x with mean 0 and standard deviation 1, over all processes."""
+    """Return x, of any shape, with mean 0 and standard deviation 1, over all processes."""
     moments = Moments()
     moments.add(x)
     return (x - moments.mean) / (moments.deviation + 1e-8)

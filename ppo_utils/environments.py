@@ -67,7 +67,7 @@ def training_envs(args: RunArgs, checkpoint: dict[str, Any] | None) -> VectorEnv
 
 
 def as_tensors(obs: dict[str, np.ndarray], device: torch.device) -> dict[str, Tensor]:
-    """Move observations to a device."""
+    """Move observations, parts (N, ...), to a device."""
     return {name: torch.from_numpy(part).to(device) for name, part in obs.items()}
 
 
