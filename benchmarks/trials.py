@@ -25,10 +25,10 @@ from suites import TASKS
 
 TRIALS = Path(__file__).with_name("trials.csv")
 COLUMNS = {  # million steps of each task's columns, and the whole trainings that stand above its trials
-    "MortarMayhem-Grid-v0": ((1.2, 1.8, 2.4, 3), ("TrXL+", "TrXL+, before", "GRU")),
-    "MortarMayhem-v0": ((1.2, 2.4, 3.6, 6), ("TrXL+", "TrXL+, before", "GRU")),
-    "MysteryPath-Grid-v0": ((2.4, 3, 4.8, 6, 9), ("TrXL+", "TrXL+, low rate", "GRU")),
-    "SearingSpotlights-v0": ((1.2, 1.8, 2.4, 3), ("TrXL+", "TrXL+, before", "GRU")),
+    "MortarMayhem-Grid-v0": ((1.2, 1.8, 2.4), ("TrXL+", "TrXL+, before", "GRU")),
+    "MortarMayhem-v0": ((1.2, 2.4, 6), ("TrXL+", "TrXL+, before", "GRU")),
+    "MysteryPath-Grid-v0": ((2.4, 4.8, 6, 9), ("TrXL+", "TrXL+, low rate", "GRU")),
+    "SearingSpotlights-v0": ((1.2, 1.8, 2.4), ("TrXL+", "TrXL+, before", "GRU")),
 }
 Curve = dict[int, float]  # mean scores by steps
 

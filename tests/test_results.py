@@ -106,6 +106,19 @@ def test_how_often_a_test_level_s_path_was_trained_on(tiny):
         assert times.tolist() == wanted
 
 
+def test_every_number_of_the_page_of_tuning_is_printed(tmp_path, monkeypatch, capsys):
+    """By its own programs, or by those of the page of results."""
+    monkeypatch.setattr(frontier, "draw", lambda *_: None)
+    speedrun.main()
+    trials.main(trials.Config())
+    frontier.main()
+    printed = capsys.readouterr().out + (ROOT / "docs/results.md").read_text()
+    page = re.sub(r"`[^`]*`", "", (ROOT / "docs/tuning.md").read_text())
+    numbers = set(re.findall(r"(?<![\d.])\d+\.\d+(?![\d.])", page))
+    assert len(numbers) > 50
+    assert numbers <= set(re.findall(r"\d+\.\d+", printed))
+
+
 def test_the_table_of_the_fastest_is_printed_by_its_command(capsys):
     speedrun.main()
     assert capsys.readouterr().out in (ROOT / "docs/tuning.md").read_text()
