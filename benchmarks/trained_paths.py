@@ -25,10 +25,11 @@ import ppo_gru
 import tables
 from ppo_utils.evaluation import beginnings
 from ppo_utils.flags import RunArgs
-from suites import COLORS, TASKS
+from suites import COLORS, LONGER, TASKS
 
 AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, low rate", "TrXL+")
 PATH_TASKS = ("MysteryPath-Grid-v0", "MysteryPath-v0")  # tasks that have the same paths
+LONG_TASK = PATH_TASKS[1]  # of which one agent has a longer training, too
 LEVELS = 100_000  # that are trained on by default
 TEST_LEVELS = learning.Training.test_levels
 COUNTED = {  # what the table calls them: id, reset options
@@ -78,6 +79,8 @@ def print_scores(out: Path) -> None:
     times = times_trained_on(ppo_gru.Args(env_id=PATH_TASKS[0]), TEST_LEVELS)
     inside = [(low <= times) & (times < high) for low, high in pairwise(EDGES)]
     results = learning.stored_results(tasks=PATH_TASKS, agents=AGENTS)
+    longer = learning.stored_results(tasks=(LONG_TASK,), steps=LONGER[LONG_TASK], agents=("TrXL+",))
+    results[LONG_TASK][f"TrXL+, {LONGER[LONG_TASK] / 1e6:g} M"] = longer[LONG_TASK]["TrXL+"]
     for axis, (env_id, agents) in zip(figure.subplots(1, 2, sharey=True), results.items(), strict=True):
         print(f"| {env_id}, path trained on | {' | '.join(columns)} | all |\n|---|{'---:|' * (len(columns) + 1)}")
         print(f"| test levels | {' | '.join(str(each.sum()) for each in inside)} | {len(times):,} |")
@@ -85,11 +88,12 @@ def print_scores(out: Path) -> None:
             scores = tables.final_scores("success", runs, every_level=True)  # (R, M, E)
             means = [scores[:, each].mean() for each in inside]
             print(f"| {agent} | {' | '.join(f'{mean:.2f}' for mean in [*means, scores.mean()])} |")
-            axis.plot(columns, means, marker="o", color=COLORS[agent], label=agent)
+            style = {} if agent in COLORS else {"linestyle": "--"}
+            axis.plot(columns, means, marker="o", color=COLORS.get(agent, COLORS["TrXL+"]), label=agent, **style)
         axis.set_title(env_id)
         axis.set_xlabel("how often the level's path was trained on")
         print()
-    axis.legend(*figure.axes[0].get_legend_handles_labels(), frameon=False)
+    axis.legend(frameon=False, fontsize=8)
     figure.axes[0].set_ylabel("success")
     figure.savefig(out, dpi=120)
 
