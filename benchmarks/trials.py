@@ -89,7 +89,7 @@ def main(config: Config) -> None:
         print(f"\n| {task} | seeds | {' | '.join(f'{millions:g} M' for millions in columns)} |")
         print(f"|---|{'---:|' * (1 + len(columns))}")
         stored = learning.stored_results(tasks=(task,), agents=agents)[task]
-        whole = {agent: [*map(curve_of, runs)] for agent, runs in stored.items()}
+        whole = {agent: [*map(curve_of, runs)] for agent, runs in stored.items() if runs}
         for agent, curves in (whole | read_trials(task)).items():
             print(row(agent, curves, columns))
 
