@@ -648,8 +648,7 @@ class Memory(nn.Module):
         with gradient (Dai et al., 2019): the same numbers, as long as the weights are those that acted.
         """
         t, env = pieces.first[:, None] // pieces.num_envs, pieces.first[:, None] % pieces.num_envs  # (S, 1) each
-        # (S, L); padding is step 0, which attends to nothing
-        episode_step = pieces.pad(state.row_step[self.window :].flatten()[pieces.flat_index()])
+        episode_step = pieces.pad(state.row_step[self.window :].flatten()[pieces.flat_index()])  # (S, L), 0 in padding
         key_columns, age, mask = attended_keys(episode_step, self.window, x.device)  # (M,), (L, M), (S, L, M)
         rows = (self.window + t + key_columns).clamp(max=len(state.row_step) - 1)  # (S, M); padding may be beyond
         attended = mask.any(1)[..., None]  # (S, M, 1)
