@@ -20,7 +20,7 @@ import tyro
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
 
 import learning
-from ppo_utils.run_logs import RunLog, read_run
+from ppo_utils.run_logs import NoCurvesError, RunLog, read_run
 from suites import TASKS
 
 TRIALS = Path(__file__).with_name("trials.csv")
@@ -48,8 +48,15 @@ def curve_of(run: RunLog) -> Curve:
 
 
 def add(agent: str, run: RunLog) -> None:
-    """Append a run's curve to the file."""
-    whose = run.args["env_id"], agent, run.args["seed"]
+    """Append a run's curve to the file. Raises SystemExit for a run that the tables could not show, or have already."""
+    whose = task, _, seed = run.args["env_id"], agent, run.args["seed"]
+    if task not in COLUMNS:
+        raise SystemExit(f"the tables have {', '.join(COLUMNS)}, not {task}")
+    if f"eval/{TASKS[task].score}" not in run.curves:
+        raise SystemExit(f"{run.path} has no evaluations; train with --eval-interval")
+    with TRIALS.open(newline="") as file:
+        if any((row["task"], row["agent"], row["seed"]) == whose for row in csv.DictReader(file)):
+            raise SystemExit(f"there is a trial of {agent} in {task} with seed {seed} already")
     with TRIALS.open("a", newline="") as file:
         rows = ((*whose, step, f"{score:.4f}") for step, score in curve_of(run).items())
         csv.writer(file, lineterminator="\n").writerows(rows)
@@ -80,7 +87,7 @@ def row(agent: str, curves: list[Curve], columns: tuple[float, ...]) -> str:
 
 
 def main(config: Config) -> None:
-    """Print the tables, or add a run. Raises NoCurvesError for a folder that holds none."""
+    """Print the tables, or add a run. Raises NoCurvesError for a folder that holds none, SystemExit as `add` does."""
     if config.add:
         agent, folder = config.add
         add(agent, read_run(str(folder)))
@@ -95,4 +102,7 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    try:
+        main(tyro.cli(Config))
+    except (NoCurvesError, OSError) as error:
+        sys.exit(f"trials.py: {error}")

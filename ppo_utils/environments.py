@@ -60,10 +60,11 @@ def training_envs(args: RunArgs, checkpoint: dict[str, Any] | None) -> VectorEnv
     try:
         return envs_for(args, share, seed=seed, first_lane=rank * share, render_mode=mode)
     except ValueError as error:
-        if args.preset != "quickstart":
+        if args.preset != "quickstart" or "option" not in str(error):
             raise
-        own = f"--preset quickstart has --env-options '{args.env_options}', give other ones: '{{}}' for the default"
-        raise ValueError(f"{error}; {own}") from None
+        raise ValueError(
+            f"{error}; --preset quickstart has options of its own, --env-options '{{}}' the default ones"
+        ) from None
 
 
 def as_tensors(obs: dict[str, np.ndarray], device: torch.device) -> dict[str, Tensor]:

@@ -137,6 +137,12 @@ def test_trials_are_printed_and_added(tiny, tmp_path, monkeypatch, capsys):
     args = {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "eval_interval": 1}
     for seed in (1, 2):
         trials.main(trials.Config(add=("new", ppo_gru.main(tiny(seed=seed, **args)))))
+    with pytest.raises(SystemExit, match="there is a trial of new in MysteryPath-Grid-v0 with seed 2 already"):
+        trials.main(trials.Config(add=("new", next((tmp_path / "runs").glob("*__2__*")))))
+    with pytest.raises(SystemExit, match="has no evaluations; train with --eval-interval"):
+        trials.main(trials.Config(add=("new", ppo_gru.main(tiny(seed=3, env_id="MysteryPath-Grid-v0")))))
+    with pytest.raises(SystemExit, match="the tables have MysteryPath-Grid-v0, not MysteryPath-v0"):
+        trials.main(trials.Config(add=("new", ppo_gru.main(tiny(env_id="MysteryPath-v0")))))
     trials.main(trials.Config())
     assert capsys.readouterr().out.splitlines()[-2:] == [
         "| `other` | 1 |  | 0.50 |  |  |",
