@@ -1,0 +1,118 @@
+"""What ends the episodes of Endless Mystery Path and Endless Searing Spotlights? Trained agents play test levels.
+
+    python benchmarks/episode_ends.py agents/endless-mystery-path-gru.pt agents/endless-searing-spotlights-gru.pt
+
+In Endless Mystery Path, an episode ends with a fall where the agent came further before, with a second fall at the same
+place, or without stamina (thesis 4.4.2); in Endless Searing Spotlights, without health or too late for a coin (4.5.2).
+"""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from gymnasium.vector import VectorEnv, VectorWrapper
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
+
+import evaluate
+from learning import FIRST_TEST_LEVEL
+from ppo_utils.checkpoints import load_weights
+from ppo_utils.environments import envs_for
+from ppo_utils.errors import RunError
+from ppo_utils.evaluation import make_agent
+from ppo_utils.flags import PositiveInt, check_bounds
+
+RIGHT = 1  # an action of Endless Mystery Path
+
+
+@dataclass
+class Config:
+    """Let agents of the two tasks play."""
+
+    checkpoints: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """files that --save-model wrote"""
+    levels: PositiveInt = 500
+    """test levels to play, each once"""
+
+
+class LastFalls(VectorWrapper):
+    """Tells of each lane's first episode in Endless Mystery Path whether it ended with a fall.
+
+    And whether that was into a column behind the furthest that its agent has reached.
+    """
+
+    def __init__(self, env: VectorEnv):
+        super().__init__(env)
+        self.playing, self.furthest = np.ones(self.num_envs, bool), np.zeros(self.num_envs, int)
+        self.fell, self.behind = np.zeros((2, self.num_envs), bool)
+
+    def step(self, actions: np.ndarray) -> tuple[Any, ...]:
+        """Step every lane."""
+        before = self.unwrapped.oracle()
+        column = before["tile"][:, 0]
+        on_path = (before["path"] == before["tile"][:, None]).all(-1).any(-1)
+        self.furthest = np.where(on_path, np.maximum(self.furthest, column), self.furthest)
+        *others, infos = self.env.step(actions)
+        if "final_info" in infos:
+            ended = infos["_final_info"] & self.playing
+            self.fell |= ended & (infos["final_info"]["num_fails"] > before["falls"])
+            self.behind |= ended & self.fell & (column + (np.ravel(actions) == RIGHT) < self.furthest)
+            self.playing &= ~ended
+        return *others, infos
+
+
+def percent(which: np.ndarray) -> str:
+    """Return the share of episodes (M,) that are true."""
+    return f"{100 * which.mean():.0f} %"
+
+
+def path_ends(envs: VectorEnv, play: Callable) -> str:
+    """Say what ends episodes of Endless Mystery Path; `play` lets the agent play in such environments."""
+    envs = LastFalls(envs)
+    play(envs)
+    again = percent(envs.fell & ~envs.behind)
+    return f"{percent(envs.behind)} fall where they came further before, {again} again at the same place"
+
+
+def light_ends(envs: VectorEnv, play: Callable) -> str:
+    """Say what ends episodes of Endless Searing Spotlights, and what an episode has."""
+    played = play(envs)
+    coins, steps = played["coins_collected"].mean(), played["length"].mean()
+    return f"{percent(played['agent_health'] <= 0)} are without health; {coins:.2f} coins in {steps:.0f} steps"
+
+
+ENDS = {"Endless-MysteryPath-v0": path_ends, "Endless-SearingSpotlights-v0": light_ends}
+
+
+def main(config: Config) -> None:
+    """Print a line for each agent; raise ValueError for one of another task, and what evaluate.py raises."""
+    check_bounds(config)
+    if not config.checkpoints:
+        raise ValueError(f"give agents of {' or '.join(ENDS)}")
+    levels = [*range(FIRST_TEST_LEVEL, FIRST_TEST_LEVEL + config.levels)]
+    for path in config.checkpoints:
+        checkpoint = evaluate.Checkpoint.read(path)
+        args = checkpoint.args
+        if args.env_id not in ENDS:
+            raise ValueError(f"{path} was trained in {args.env_id}; give agents of {' or '.join(ENDS)}")
+        envs = envs_for(args, config.levels)
+        agent = make_agent(checkpoint.script.Agent, envs, envs.reset()[1], args)
+        load_weights(agent, checkpoint.saved, path)
+        torch.manual_seed(0)
+        said = ENDS[args.env_id](envs, lambda envs, agent=agent: evaluate.evaluate(agent, envs, levels, sys.maxsize))
+        print(f"{path}: {said}")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Config))
+    except (ValueError, OSError, ImportError, gym.error.Error, RunError) as error:
+        sys.exit(f"episode_ends.py: {' '.join(str(error).split())}")
+    except KeyboardInterrupt:
+        sys.exit(130)
