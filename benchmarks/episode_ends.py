@@ -4,11 +4,14 @@
 
 In Endless Mystery Path, an episode ends with a fall where the agent came further before, with a second fall at the same
 place, or without stamina (thesis 4.4.2); in Endless Searing Spotlights, without health or too late for a coin (4.5.2).
+
+Shape letters: N environments, one for each of M test levels.
 """
 
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,6 +30,7 @@ from ppo_utils.environments import envs_for
 from ppo_utils.errors import RunError
 from ppo_utils.evaluation import make_agent
 from ppo_utils.flags import PositiveInt, check_bounds
+from ppo_utils.terminal import one_line_exit
 
 RIGHT = 1  # an action of Endless Mystery Path
 
@@ -42,27 +46,26 @@ class Config:
 
 
 class LastFalls(VectorWrapper):
-    """Tells of each lane's first episode in Endless Mystery Path whether it ended with a fall.
+    """Tells of each lane's first episode in Endless Mystery Path whether it ended with a fall: `fell` (N,).
 
-    And whether that was into a column behind the furthest that its agent has reached.
+    And whether that was into a column behind the furthest that its agent has reached: `behind` (N,). For the default
+    options, with which a step crosses at most one column's border.
     """
 
     def __init__(self, env: VectorEnv):
         super().__init__(env)
-        self.playing, self.furthest = np.ones(self.num_envs, bool), np.zeros(self.num_envs, int)
+        self.playing = np.ones(self.num_envs, bool)
         self.fell, self.behind = np.zeros((2, self.num_envs), bool)
 
     def step(self, actions: np.ndarray) -> tuple[Any, ...]:
         """Step every lane."""
         before = self.unwrapped.oracle()
-        column = before["tile"][:, 0]
-        on_path = (before["path"] == before["tile"][:, None]).all(-1).any(-1)
-        self.furthest = np.where(on_path, np.maximum(self.furthest, column), self.furthest)
+        column = before["tile"][:, 0] + (np.ravel(actions) == RIGHT)  # where a fall would be
         *others, infos = self.env.step(actions)
         if "final_info" in infos:
-            ended = infos["_final_info"] & self.playing
-            self.fell |= ended & (infos["final_info"]["num_fails"] > before["falls"])
-            self.behind |= ended & self.fell & (column + (np.ravel(actions) == RIGHT) < self.furthest)
+            ended, final = infos["_final_info"] & self.playing, infos["final_info"]
+            self.fell |= ended & (final["num_fails"] > before["falls"])
+            self.behind |= ended & self.fell & (column < final["max_x"])
             self.playing &= ~ended
         return *others, infos
 
@@ -77,7 +80,8 @@ def path_ends(envs: VectorEnv, play: Callable) -> str:
     envs = LastFalls(envs)
     play(envs)
     again = percent(envs.fell & ~envs.behind)
-    return f"{percent(envs.behind)} fall where they came further before, {again} again at the same place"
+    never = percent(~envs.fell)
+    return f"{percent(envs.behind)} fall where they came further before, {again} at the same place again, {never} do not"
 
 
 def light_ends(envs: VectorEnv, play: Callable) -> str:
@@ -105,14 +109,11 @@ def main(config: Config) -> None:
         agent = make_agent(checkpoint.script.Agent, envs, envs.reset()[1], args)
         load_weights(agent, checkpoint.saved, path)
         torch.manual_seed(0)
-        said = ENDS[args.env_id](envs, lambda envs, agent=agent: evaluate.evaluate(agent, envs, levels, sys.maxsize))
-        print(f"{path}: {said}")
+        play = partial(evaluate.evaluate, agent, levels=levels, max_steps=sys.maxsize)
+        print(f"{path}: {ENDS[args.env_id](envs, play)}")
+        envs.close()
 
 
 if __name__ == "__main__":
-    try:
+    with one_line_exit(ValueError, OSError, ImportError, gym.error.Error, RunError):
         main(tyro.cli(Config))
-    except (ValueError, OSError, ImportError, gym.error.Error, RunError) as error:
-        sys.exit(f"episode_ends.py: {' '.join(str(error).split())}")
-    except KeyboardInterrupt:
-        sys.exit(130)
