@@ -79,9 +79,8 @@ def path_ends(envs: VectorEnv, play: Callable) -> str:
     """Say what ends episodes of Endless Mystery Path; `play` lets the agent play in such environments."""
     envs = LastFalls(envs)
     play(envs)
-    again = percent(envs.fell & ~envs.behind)
-    never = percent(~envs.fell)
-    return f"{percent(envs.behind)} fall where they came further before, {again} at the same place again, {never} do not"
+    behind, again, never = map(percent, (envs.behind, envs.fell & ~envs.behind, ~envs.fell))
+    return f"{behind} fall where they came further before, {again} at the same place again, {never} do not"
 
 
 def light_ends(envs: VectorEnv, play: Callable) -> str:

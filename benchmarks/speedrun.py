@@ -1,4 +1,4 @@
-"""Who learns a task to its target with the fewest minutes or steps? The table of docs/results.md, whose rules these are.
+"""Who learns a task to its target with the fewest minutes or steps? A table of docs/results.md, which has the rules.
 
     python benchmarks/speedrun.py
 

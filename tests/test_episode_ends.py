@@ -57,7 +57,8 @@ def test_what_is_said_of_an_agent(tiny, tmp_path, monkeypatch, capsys, env_id):
     assert levels == [*range(learning.FIRST_TEST_LEVEL, learning.FIRST_TEST_LEVEL + 20)]
     assert played["finished"].all()
     if env_id == "Endless-MysteryPath-v0":
-        behind, again, never = (round(100 * np.mean(each)) for each in (envs.behind, envs.fell & ~envs.behind, ~envs.fell))
+        shares = (envs.behind, envs.fell & ~envs.behind, ~envs.fell)
+        behind, again, never = (round(100 * np.mean(each)) for each in shares)
         told = f"{behind} % fall where they came further before, {again} % at the same place again, {never} % do not"
     else:
         dead = round(100 * np.mean(played["agent_health"] == 0))
