@@ -207,6 +207,7 @@ STATEMENTS = (
         "120, 18 commands; return 2.65, 2.02; about 20, 6 coins",
         claims_of("score", f"{ENDLESS} Endless-MortarMayhem-v0-20M", GRU, PLUS)
         | claims_of("rollout", "Endless-MortarMayhem-v0-20M", LONG_ROLLOUTS, PLUS)
+        | claims_of("score", "small-endless", GRU, TRXL)
         | claims_of("same-score", f"{ENDLESS} Endless-MortarMayhem-v0-20M Endless-MysteryPath-v0-9M", GRU, SAME),
     ),
     Statement(
