@@ -80,7 +80,7 @@ def path_ends(envs: VectorEnv, play: Callable) -> str:
     envs = LastFalls(envs)
     play(envs)
     behind, again, never = map(percent, (envs.behind, envs.fell & ~envs.behind, ~envs.fell))
-    return f"{behind} fall where they came further before, {again} at the same place again, {never} do not"
+    return f"{behind} fall where they came further before, {again} at the same place again, {never} do not fall"
 
 
 def light_ends(envs: VectorEnv, play: Callable) -> str:
