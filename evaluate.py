@@ -31,6 +31,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 import tyro
+from torch import nn
 from tqdm import tqdm
 
 from ppo_utils.checkpoints import import_script, load_weights, read_model, saved_args
@@ -114,6 +115,16 @@ class Checkpoint:
         step = {} if self.step is None else {"step": self.step}
         return {"script": self.script.__name__, **asdict(self.args), **step}
 
+    def agent(self, envs: gym.vector.VectorEnv) -> nn.Module:
+        """Return the agent, on the CPU, for environments that are reset; raise ValueError for weights that do not fit.
+
+        Raises what `make_agent` raises.
+        """
+        _, infos = envs.reset()
+        agent = make_agent(self.script.Agent, envs, infos, self.args)
+        load_weights(agent, self.saved, self.path)
+        return agent
+
 
 def play(checkpoint: Checkpoint, config: Config) -> dict[str, np.ndarray]:
     """Let a checkpoint's agent play the levels; return numbers (M, E) by name.
@@ -129,9 +140,7 @@ def play(checkpoint: Checkpoint, config: Config) -> dict[str, np.ndarray]:
         with report_out_of_memory(config, device):
             envs = envs_for(args, len(batch), asynchronous=False)  # a process for each episode would be many
             if agent is None:
-                _, infos = envs.reset()
-                agent = make_agent(checkpoint.script.Agent, envs, infos, args).to(device)
-                load_weights(agent, checkpoint.saved, checkpoint.path)
+                agent = checkpoint.agent(envs).to(device)
                 torch.manual_seed(config.seed)
             played = evaluate(agent, envs, batch, config.max_steps, amp=args.amp, deterministic=config.deterministic)
         envs.close()

@@ -224,11 +224,15 @@ STATEMENTS = (
     Statement("6.4 In Mystery Path, an iteration of GTrXL takes less time than of TrXL", "table 6.4"),
     Statement("6.4 In Mystery Path, GRU and TrXL learn as much in an hour", "figure 6.4"),
     Statement(
-        "6.5.1 TrXL's blocks attend to different steps",
+        "6.5.1 TrXL's blocks attend to different steps ([one block here](results.md#what-the-transformer-attends-to))",
         "in the clue task, two to each command's first step, the last to the episode's; in the act task, the last to "
         "the due command's",
     ),
-    Statement("6.5.2 TrXL's first block attends to falls, later ones to a tile visited 20 steps before", "figure 6.7"),
+    Statement(
+        "6.5.2 TrXL's first block attends to falls, later ones to a tile visited 20 steps before ([one block "
+        "here](results.md#what-the-transformer-attends-to))",
+        "figure 6.7",
+    ),
     Statement(
         "6.5.2 GRU falls off more often in Mystery Path",
         "5.65, 4.87 times",

@@ -25,10 +25,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other pac
 
 import evaluate
 from learning import FIRST_TEST_LEVEL
-from ppo_utils.checkpoints import load_weights
 from ppo_utils.environments import envs_for
 from ppo_utils.errors import RunError
-from ppo_utils.evaluation import make_agent
 from ppo_utils.flags import PositiveInt, check_bounds
 from ppo_utils.terminal import one_line_exit
 
@@ -105,8 +103,7 @@ def main(config: Config) -> None:
         if args.env_id not in ENDS:
             raise ValueError(f"{path} was trained in {args.env_id}; give agents of {' or '.join(ENDS)}")
         envs = envs_for(args, config.levels)
-        agent = make_agent(checkpoint.script.Agent, envs, envs.reset()[1], args)
-        load_weights(agent, checkpoint.saved, path)
+        agent = checkpoint.agent(envs)
         torch.manual_seed(0)
         play = partial(evaluate.evaluate, agent, levels=levels, max_steps=sys.maxsize)
         print(f"{path}: {ENDS[args.env_id](envs, play)}")

@@ -1,0 +1,161 @@
+"""What do trained transformers attend to? How much goes to the due command's clue, and to falls (thesis 6.5).
+
+    python benchmarks/attention.py agents/mortar-mayhem-grid-trxl.pt agents/mystery-path-grid-trxl.pt
+
+In Mortar Mayhem, a command is carried out long after it was shown; in Mystery Path, the agent has to remember where it
+fell off. Agents play test levels, and a step is counted if it can attend to what is looked for. The table has the mean
+share of this among the steps that it attends to, which is what uniform attention would give, and the mean share of the
+attention, of each head (blocks are separated by semicolons).
+
+Shape letters: N environments, one for each test level, H heads, M earlier steps that a step attends to.
+"""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from gymnasium.vector import VectorEnv, VectorWrapper
+from torch import nn
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
+
+import evaluate
+from enjoy import attention_weights
+from learning import FIRST_TEST_LEVEL
+from ppo_utils.environments import envs_for
+from ppo_utils.errors import RunError
+from ppo_utils.flags import PositiveInt, check_bounds
+from ppo_utils.terminal import one_line_exit
+
+SHOWS_NONE, WANTS_NONE = -1, -2
+HEADING = """| agent | looked for | of the steps | of the attention of its heads |
+|---|---|---:|---:|"""
+
+
+@dataclass
+class Config:
+    """Let transformers play Mortar Mayhem or Mystery Path."""
+
+    checkpoints: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """files that --save-model wrote"""
+    levels: PositiveInt = 100
+    """test levels to play, each once"""
+
+
+def commands(s: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return which command of the sequence Mortar Mayhem shows, and which is to be carried out now, (N,) each."""
+    period = s.show_duration + s.show_delay
+    first = s.count - s.clue_end // period  # in the endless task, a clue shows the new commands only
+    shown = np.where(s.symbol > 0, first + s.clue_step // period, SHOWS_NONE)
+    acts = (s.clue_step >= s.clue_end) & ~s.burning
+    return shown, np.where(acts, s.current, WANTS_NONE)
+
+
+def falls(s: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return 0 where Mystery Path shows a fall, and 0, which is looked for, (N,) each."""
+    return np.where(s.fallen, 0, SHOWS_NONE), np.zeros(len(s.fallen))
+
+
+COMMANDS, FALLS = ("the due command", commands), ("falls", falls)
+SUBJECTS = {
+    "MortarMayhem-v0": COMMANDS,
+    "MortarMayhem-Grid-v0": COMMANDS,
+    "Endless-MortarMayhem-v0": COMMANDS,
+    "MysteryPath-v0": FALLS,
+    "MysteryPath-Grid-v0": FALLS,
+    "Endless-MysteryPath-v0": FALLS,
+}
+
+
+class Shown(VectorWrapper):
+    """Tells of each lane's first episode what its steps showed."""
+
+    def __init__(self, env: VectorEnv, look: Callable[[Any], tuple[np.ndarray, np.ndarray]]):
+        super().__init__(env)
+        self.look, self.playing = look, np.ones(self.num_envs, bool)
+
+    def reset(self, **given: Any) -> tuple[Any, dict]:
+        """Reset every lane."""
+        results = self.env.reset(**given)
+        shown, self.wanted = self.look(self.unwrapped.state)
+        self.shown = [shown]  # at each step, (N,)
+        return results
+
+    def step(self, actions: np.ndarray) -> tuple[Any, ...]:
+        """Step every lane."""
+        *results, infos = self.env.step(actions)
+        if "final_info" in infos:
+            self.playing &= ~infos["_final_info"]
+        shown, self.wanted = self.look(self.unwrapped.state)
+        self.shown.append(shown)
+        return *results, infos
+
+    def wanted_among(self, earlier: int) -> np.ndarray:
+        """Return which of so many steps before the present one showed what is looked for now, (N, earlier)."""
+        shown = np.stack(self.shown[-1 - earlier : -1], 1)
+        return (shown == self.wanted[:, None]) & self.playing[:, None]
+
+
+def attended(agent: nn.Module, envs: Shown, levels: list[int]) -> tuple[float, list[np.ndarray]]:
+    """Let an agent play; return the share of what is looked for among the steps attended to, and of the attention.
+
+    The latter of each block by head, (H,). Raises ValueError if no step could attend to what is looked for.
+    """
+    uniform = []
+    weights: list[list[np.ndarray]] = [[] for _ in agent.memory.blocks]
+
+    def add(block: int, given: tuple) -> None:
+        x, keys, _, age, mask = given
+        earlier = keys.shape[1]
+        if earlier >= len(envs.shown):  # an episode's first step has an empty key
+            return
+        attends = mask[:, 0].numpy()  # (N, M)
+        wanted = envs.wanted_among(earlier) & attends
+        asks = wanted.any(1)
+        if block == 0:
+            uniform.append((wanted.sum(1) / attends.sum(1).clip(1))[asks])
+        of_block = attention_weights(agent.memory.blocks[block].attention, x, keys, age, mask)[:, :, 0]  # (N, H, M)
+        weights[block].append((of_block.numpy() * wanted[:, None]).sum(-1)[asks])
+
+    for number, block in enumerate(agent.memory.blocks):
+        block.attention.register_forward_pre_hook(lambda _, given, number=number: add(number, given))
+    evaluate.evaluate(agent, envs, levels, sys.maxsize)
+    shares = np.concatenate(uniform)
+    if not len(shares):
+        raise ValueError("in these levels, no step could attend to what is looked for")
+    return shares.mean(), [np.concatenate(each).mean(0) for each in weights]
+
+
+def main(config: Config) -> None:
+    """Print a table, an agent a row; raise ValueError for one of another task, and what evaluate.py raises."""
+    check_bounds(config)
+    suitable = f"give agents that ppo_trxl.py trained in {', '.join(SUBJECTS)}"
+    if not config.checkpoints:
+        raise ValueError(suitable)
+    levels = [*range(FIRST_TEST_LEVEL, FIRST_TEST_LEVEL + config.levels)]
+    rows = []
+    for path in config.checkpoints:
+        checkpoint = evaluate.Checkpoint.read(path)
+        args = checkpoint.args
+        if args.env_id not in SUBJECTS or not hasattr(args, "trxl_memory_length"):
+            raise ValueError(f"{path} was trained by {checkpoint.script.__name__}.py in {args.env_id}; {suitable}")
+        name, look = SUBJECTS[args.env_id]
+        envs = Shown(envs_for(args, config.levels), look)
+        agent = checkpoint.agent(envs)
+        torch.manual_seed(0)
+        share, blocks = attended(agent, envs, levels)
+        heads = "; ".join(", ".join(f"{100 * head:.0f}" for head in block) for block in blocks)
+        rows.append(f"| `{Path(path).name}` | {name} | {100 * share:.0f} % | {heads} % |")
+        envs.close()
+    print("\n".join([HEADING, *rows]))
+
+
+if __name__ == "__main__":
+    with one_line_exit(ValueError, OSError, ImportError, gym.error.Error, RunError):
+        main(tyro.cli(Config))
