@@ -1,15 +1,13 @@
 """ppo_utils.acting: an agent from a file, in a loop of one's own, acts as in its training and its evaluation."""
 
-import re
-from pathlib import Path
-
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, SCRIPTS
+from conftest import SCRIPTS
 from test_environments import shows
 
+import export_step
 import ppo_gru
 import ppo_trxl
 from ppo_utils import acting, evaluation
@@ -91,23 +89,22 @@ def test_an_observation_of_another_space(trained):
             player.act(wrong)
 
 
-def code_of(page):
-    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.S)
-
-
 @pytest.mark.parametrize(("script", "changes"), [
     (ppo_gru, {"num_layers": 2}), (ppo_gru, {"memory": "lstm"}),
     (ppo_trxl, {"trxl_positional_encoding": "learned", "trxl_query_position": True}),
     (ppo_trxl, {"trxl_positional_encoding": "relative", "trxl_gate": "gru", "trxl_layer_norm": "post"}),
 ])  # fmt: skip
-def test_a_step_is_exported_as_documented(trained, script, changes, monkeypatch):
+def test_a_step_is_exported(trained, tmp_path, script, changes):
     """Over 20 steps of two episodes, a window of 7 included: the agent's own logits and values, to 1e-6."""
-    (_, load, gru, trxl, export) = code_of("docs/evaluation.md")
-    names = {"path": str(trained(script, 1, env_id="MysteryPath-Grid-v0", value_init_gain=0.5, **changes))}
-    exec("\n".join([load, gru if script is ppo_gru else trxl, export]), names)
-    agent, step, state = names["player"].agent, names["exported"].module(), names["beginning"]
+    path = str(trained(script, 1, env_id="MysteryPath-Grid-v0", value_init_gain=0.5, **changes))
+    export_step.main(export_step.Config(path, str(tmp_path / "step.pt2")))
+    step = torch.export.load(tmp_path / "step.pt2").module()
+    player = Player(path)
+    agent = player.agent
+    beginning = export_step.STEPS[type(agent)](agent).beginning()
+    state = beginning
     memory = agent.memory.begin_rollout(agent.memory.initial(1, torch.device("cpu")), 64)
-    envs = envs_for(names["player"].args, 1)
+    envs = envs_for(player.args, 1)
     obs, _ = envs.reset(seed=1)
     for t in range(40):
         obs = {name: torch.from_numpy(part) for name, part in obs.items()}
@@ -122,8 +119,13 @@ def test_a_step_is_exported_as_documented(trained, script, changes, monkeypatch)
         obs, *_ = envs.step(np.array([[t % 4]]))
         if t == 25:  # a new episode: the state begins as it did
             agent.memory.reset(memory, torch.tensor([True]))
-            state = names["beginning"]
-    assert Path("step.pt2").exists()
+            state = beginning
+
+
+def test_who_cannot_be_exported(trained, monkeypatch):
+    monkeypatch.delitem(export_step.STEPS, ppo_gru.Agent)
+    with pytest.raises(ValueError, match=r"only agents of ppo_gru.py and ppo_trxl.py can be exported"):
+        export_step.main(export_step.Config(str(trained(ppo_gru, env_id="CartPole-v1"))))
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

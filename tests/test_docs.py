@@ -35,7 +35,7 @@ README = ROOT / "README.md"
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [README, ROOT / "agents/README.md", *DOCS]
 SCRIPTS = (ppo_gru, ppo_trxl)
-PROGRAMS = [*ROOT.glob("*.py"), *(ROOT / "benchmarks").glob("*.py")]
+PROGRAMS = [*ROOT.glob("*.py"), *(ROOT / "benchmarks").glob("*.py"), ROOT / "examples/export_step.py"]
 
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 

@@ -1,10 +1,7 @@
-"""docs/extend.md, an environment: its family has all that those of the package have."""
+"""examples/recall.py: its family has all that those of the package have."""
 
-import importlib
 import pickle
-import re
 import warnings
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -13,18 +10,10 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from helpers import check_same, roll
 
+import examples.recall  # noqa: F401 (registers Recall-v0)
 from ppo_utils.environments import is_memory_gym, make_envs
 
-PAGE = (Path(__file__).parents[2] / "docs/extend.md").read_text().split("\n## An environment\n")[1]
 OPTIONS = {"delay": 3, "reward_success": 0.5}
-
-
-@pytest.fixture(autouse=True)
-def recall(tmp_path, monkeypatch):
-    """The page's code, as a module."""
-    (tmp_path / "recall.py").write_text(re.search(r"```python\n(.*?)```", PAGE, re.S)[1])
-    monkeypatch.syspath_prepend(tmp_path)
-    importlib.import_module("recall")
 
 
 @pytest.mark.parametrize("obs_type", ["pixels", "vector"])
@@ -81,8 +70,8 @@ def test_levels_and_debug_view():
 
 def test_scripts_can_train_on_it():
     """With levels, reset options and vectors, as on those of the package."""
-    assert is_memory_gym("recall:Recall-v0")
-    envs = make_envs("recall:Recall-v0", 3, seed=1, obs_type="vector", num_levels=5, options=OPTIONS)
+    assert is_memory_gym("examples.recall:Recall-v0")
+    envs = make_envs("examples.recall:Recall-v0", 3, seed=1, obs_type="vector", num_levels=5, options=OPTIONS)
     observations, _ = envs.reset()
     assert observations["observation"].shape == (3, 3)
     assert set(envs.np_random_seed) <= set(range(5))
