@@ -8,10 +8,11 @@ Tasks, runs and results are those of benchmarks/learning.py: small networks, vec
 A claim compares pairs of agents: each that is said to have the higher number (A in the table) with each that is said to
 have the lower one (B). A pair is decided as in the tables of results (`tables.Comparison`): by Welch's t-test over
 seeds and levels. The claim holds if all of its pairs are decided its way; it does not hold if one is decided the other
-way, with its p-value multiplied by the number of pairs; else it is not decided. Where the thesis says that agents are
-no better than others, that is contradicted if one of them is ahead, with p as before. Where no agent of a row scores
-higher than those without memory, or all have less than a quarter of what is possible (in endless tasks, of what the
-thesis' transformer has; nine tenths where falls are counted), the task has not been learned, and there is no verdict.
+way, with its p-value multiplied by the number of pairs; else it is not decided, and of a single pair the table has the
+95 % interval of the difference. Where the thesis says that agents are no better than others, that is contradicted if
+one of them is ahead, with p as before. Where no agent of a row scores higher than those without memory, or all have
+less than a quarter of what is possible (in endless tasks, of what the thesis' transformer has; nine tenths where falls
+are counted), the task has not been learned, and there is no verdict.
 
 With so many rows, some verdicts come by chance. A star marks those that also stand at a family-wise error of 5 % (Holm,
 1979). A row of several pairs has the largest of their p-values where all of them are needed, else the smallest times
@@ -368,8 +369,11 @@ class Verdict:
 
     text: str
     p_value: float = 1.0
+    interval: tuple[float, float] | None = None  # of the difference of A and B, if there is one
 
     def __str__(self) -> str:
+        if self.interval:
+            return "{}, A - B: {:.2f} to {:.2f}".format(self.text, *self.interval)
         if self.p_value == 1:
             return self.text
         return f"{self.text}, p {f'= {self.p_value:.3f}' if self.p_value >= 0.0005 else '< 0.001'}"
@@ -389,7 +393,7 @@ def verdict(claim: Claim, pairs: list[Comparison]) -> Verdict:
     ):
         if found.p_value < LEVEL:
             return found
-    return Verdict("not decided")
+    return Verdict("not decided", interval=pairs[0].interval if len(pairs) == 1 else None)
 
 
 def aim_of(name: str) -> float | None:

@@ -136,6 +136,7 @@ class Comparison:
 
     errors: float
     p_value: float  # two-sided
+    interval: tuple[float, float] = (-math.inf, math.inf)  # of the difference, at a level of 1 - LEVEL
 
     @property
     def is_ahead(self) -> bool:
@@ -157,10 +158,14 @@ class Comparison:
         freedom = [len(higher) - 1, len(lower) - 1, max(len(levels) - 1, 1)]
         difference, variance = levels.mean(), sum(parts)
         if not variance:
-            return cls(math.copysign(math.inf, difference), 0.0) if difference else cls(0.0, 1.0)
-        errors = difference / math.sqrt(variance)
+            errors, p_value = (math.copysign(math.inf, difference), 0.0) if difference else (0.0, 1.0)
+            return cls(errors, p_value, (difference, difference))
+        error = math.sqrt(variance)
         of_all = variance**2 / sum(part**2 / each for part, each in zip(parts, freedom, strict=True))
-        return cls(errors, 2 * scipy.stats.t.sf(abs(errors), min(of_all, freedom[0] + freedom[1])))
+        student = scipy.stats.t(min(of_all, freedom[0] + freedom[1]))
+        margin = error * student.isf(LEVEL / 2)
+        p_value = 2 * student.sf(abs(difference / error))
+        return cls(difference / error, p_value, (difference - margin, difference + margin))
 
 
 # ---- ONE TASK ----

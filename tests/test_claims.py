@@ -41,6 +41,7 @@ def test_verdicts(pairs, expects_difference, text, p_value):
     claim = claims.Claim("small-endless", ("GRU",), ("TrXL",), expects_difference=expects_difference)
     found = claims.verdict(claim, pairs)
     assert (found.text, found.p_value) == (text, pytest.approx(p_value))
+    assert found.interval == (pairs[0].interval if text == "not decided" and len(pairs) == 1 else None)
 
 
 def test_a_comparison_by_hand():
@@ -49,9 +50,11 @@ def test_a_comparison_by_hand():
     found = tables.Comparison.of(higher, lower)
     assert found.errors == pytest.approx(2 / np.sqrt(2 / 2 + 0 + 2 / 2))
     assert found.p_value == pytest.approx(2 * scipy.stats.t.sf(np.sqrt(2), 2))
+    assert found.interval == pytest.approx((2 - 4.302653 * np.sqrt(2), 2 + 4.302653 * np.sqrt(2)))  # of Student's table
     assert tables.Comparison.of(lower, higher).errors == -found.errors
     assert tables.Comparison.of(lower, lower).errors == 0
     assert tables.Comparison.of(np.array([[3.0], [5.0]]), np.array([[1.0], [1.0]])).errors == pytest.approx(3.0)
+    assert tables.Comparison.of(lower + 1, lower).interval == (1.0, 1.0)
     assert tables.Comparison.of(higher[:1], lower) == tables.Comparison(0.0, 1.0), "one seed tells nothing"
 
 
@@ -144,6 +147,7 @@ def test_verdicts_say_how_likely_they_come_by_chance():
     assert str(claims.Verdict("holds", 0.0274)) == "holds, p = 0.027"
     assert str(claims.Verdict("holds", 0.0004)) == "holds, p < 0.001"
     assert str(claims.Verdict("not decided")) == "not decided"
+    assert str(claims.Verdict("not decided", interval=(-0.034, 1.2))) == "not decided, A - B: -0.03 to 1.20"
 
 
 def test_agents_of_a_comparison_of_equals_have_equal_settings():
