@@ -35,7 +35,7 @@ from torch import nn
 from tqdm import tqdm
 
 from ppo_utils.checkpoints import import_script, load_weights, read_model, saved_args
-from ppo_utils.environments import envs_for, with_options
+from ppo_utils.environments import envs_for, is_memory_gym, with_options
 from ppo_utils.errors import RunError
 from ppo_utils.evaluation import are_trained_on, evaluate, evaluation_levels, first_after, make_agent
 from ppo_utils.flags import NonNegativeInt, PositiveInt, check_bounds
@@ -203,6 +203,9 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
         print(f"{title}\n\n{table(summaries)}\n")
         if finished < 1:
             print(f"--max-steps cut {1 - finished:.2%} of the episodes; what only their end tells is left out\n")
+        training = arguments[paths[0]]
+        if is_memory_gym(training["env_id"]) and training["num_levels"] and not config.new_levels:
+            print("Some of these levels may begin as levels of the training do; --new-levels plays only others\n")
     if not report:
         raise ValueError(f"no task reports {', '.join(config.metrics)}")
     return report

@@ -38,3 +38,4 @@ def test_an_agent_plays_as_well_as_published(name, metric, score, flags):
 
     (planned,) = learning.plans_of(tyro.cli(learning.Config, args=shlex.split(flags))).values()
     assert learning.settings(asdict(planned.args)) == learning.settings(asdict(checkpoint.args))
+    assert planned.args.exp_name == checkpoint.args.exp_name

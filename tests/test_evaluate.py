@@ -722,6 +722,22 @@ def test_other_levels(agents):
     assert ", levels 90 to 139, " in evaluate.title_of(without_levels, evaluate.Config(start_level=90))
 
 
+@pytest.mark.parametrize(
+    ("env_id", "num_levels", "asked", "told"),
+    [
+        ("MysteryPath-Grid-v0", 1000, {}, True),
+        ("MysteryPath-Grid-v0", 0, {}, False),
+        ("MysteryPath-Grid-v0", 10, {"new_levels": True}, False),
+        ("CartPole-v1", 10, {}, False),
+    ],
+)
+def test_levels_may_begin_as_those_of_the_training(tiny, capsys, env_id, num_levels, asked, told):
+    folder = ppo_gru.main(tiny(env_id=env_id, num_levels=num_levels, save_model=True, ground_truth_coef=0.0))
+    capsys.readouterr()
+    evaluate.main(evaluate.Config((f"{folder}/model.pt",), levels=2, repeats=1, **asked))
+    assert ("--new-levels plays only others" in capsys.readouterr().out) == told
+
+
 def test_reset_options_over_those_of_the_training(tiny):
     trained = tiny(env_id="MysteryPath-Grid-v0", env_options='{"max_steps": 30, "show_goal": true}', save_model=True)
     agents = [str(ppo_gru.main(trained))]
