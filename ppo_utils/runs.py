@@ -95,6 +95,8 @@ def prepare(args: RunArgs, script: str) -> tuple[Run, dict[str, np.ndarray], dic
     torch.backends.cudnn.deterministic = True
     # The momentum of idle units fills with numbers below 1e-38, which slow a CPU down several times: they become 0.
     torch.set_flush_denormal(True)  # for this thread, and those that it starts
+    if args.obs_type == "vector" and "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(1)  # of small networks, threads mostly wait for each other
     device = torch.device("cpu")
     if torch.cuda.is_available() and args.cuda:
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))

@@ -142,6 +142,22 @@ def test_numbers_that_slow_a_cpu_down_are_zero(tiny):
         assert not pool.submit(products).result().any()
 
 
+@pytest.mark.parametrize(
+    ("obs_type", "variable", "threads"), [("vector", None, 1), ("vector", "2", 2), ("pixels", None, 2)]
+)
+def test_threads_of_a_training(tiny, monkeypatch, obs_type, variable, threads):
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    if variable:
+        monkeypatch.setenv("OMP_NUM_THREADS", variable)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        ppo_gru.main(tiny(env_id="MysteryPath-Grid-v0", obs_type=obs_type))
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_trains_on_vectors_and_their_frequencies(tiny, scalars):
     """The network takes the Fourier features, and a model that is older than the flag is one without them."""
     vectors = {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "save_model": True}
