@@ -34,7 +34,7 @@ from ppo_utils.flags import PositiveInt, check_bounds
 from ppo_utils.terminal import one_line_exit
 
 SHOWS_NONE, WANTS_NONE = -1, -2
-HEADING = """| agent | looked for | of the steps | of the attention of its heads |
+HEADING = """| agent | looked for | if spread evenly | attention of each head |
 |---|---|---:|---:|"""
 
 

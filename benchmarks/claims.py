@@ -52,8 +52,10 @@ TASKS = {
     },
     "ends-shown": Task("MysteryPath-Grid-v0", 6_000_000, ENDS_SHOWN, gru_flags=suites.LOW_RATE),
     "all-visible": Task("SearingSpotlights-v0", 2_000_000, ALL_VISIBLE),
+    "flat-list": Task("MortarMayhemB-Grid-v0", 6_000_000),
     "small-endless": replace(suites.SMALL["endless-mortar-mayhem"], total_timesteps=3_000_000),
 }
+HOLDING, FAILING = ("holds", "not contradicted"), ("does not hold", "contradicted")  # verdicts
 # Of a task's aim, what one of a row's agents has, if the task has been learned; all of them, where falls are counted,
 # since those that fail fall for other reasons.
 SHARE, SHARE_OF_FALLS = 0.25, 0.9
@@ -121,7 +123,7 @@ in_endless = partial(Claim, "small-endless")
 GRU, TRXL, PLUS, GATED = ("GRU",), ("TrXL",), ("TrXL+",), ("GTrXL+",)
 SAME = ("TrXL+, before",)  # with the GRU's learning rate, discount factor and weight of the value
 MEMORY, FRAMES = ("GRU", "TrXL+"), ("no memory", "16 frames")
-FEW_FRAMES = ("no memory", "4 frames", "step encoding")
+FEW_FRAMES, FEW = ("no memory", "4 frames", "step encoding"), ("step encoding", "16 frames")
 LONG_ROLLOUTS = ("GRU --num-envs 32 --num-steps 512",)  # as the thesis has them
 QUERY_POSITION, NORMALIZED = "TrXL --trxl-query-position", "GRU --norm-adv minibatch"
 QUICK_DECAY = "--anneal-steps 600000"  # as in the thesis, the rate is at its final value after a fifth of the training
@@ -139,12 +141,14 @@ STATEMENTS = (
     Statement(
         "6.2.1 Memory is best in the act task",
         "10 commands; step encoding 9.5, 16 frames 8, 4 frames 5",
-        claims_of("memory", "MortarMayhemB-Grid-v0", MEMORY, (*FEW_FRAMES, "16 frames")),
+        claims_of("memory", "MortarMayhemB-Grid-v0", MEMORY, (*FEW_FRAMES, "16 frames"))
+        | claims_of("memory", "flat-list", ("GRU", *SAME), ("no memory", *FEW), flags="--no-attend-commands"),
     ),
     Statement(
         "6.2.1 Frames or the step help in the act task",
         "no memory is ineffective",
-        claims_of("frames", "MortarMayhemB-Grid-v0", ("step encoding", "4 frames", "16 frames"), ("no memory",)),
+        claims_of("frames", "MortarMayhemB-Grid-v0", ("step encoding", "4 frames", "16 frames"), ("no memory",))
+        | claims_of("frames", "flat-list", FEW, ("no memory",), flags="--no-attend-commands"),
     ),
     Statement(
         "6.2.1 With its ends shown, 16 frames are enough in Mystery Path",
@@ -216,7 +220,10 @@ STATEMENTS = (
         "3,462 (at its peak), 288 steps; 600, 400; 600, 200",
         claims_of("length", f"{ENDLESS} Endless-MortarMayhem-v0-20M", GRU, PLUS, measure="length"),
     ),
-    Statement("6.3 GRU still learns at the end of Endless Mystery Path and Searing Spotlights", "after 819 M steps"),
+    Statement(
+        "6.3 At the end, GRU still learns in Endless Searing Spotlights, GRU and TrXL in Endless Mystery Path",
+        "after 819 M steps",
+    ),
     Statement("6.3 TrXL is worse with reconstruction in Endless Mortar Mayhem", "18, with it 10 commands"),
     Statement(
         "6.4 An iteration of GRU takes less time ([speeds here](running.md#speed))",
@@ -224,37 +231,42 @@ STATEMENTS = (
     ),
     Statement("6.4 In Mystery Path, an iteration of GTrXL takes less time than of TrXL", "table 6.4"),
     Statement("6.4 In Mystery Path, GRU and TrXL learn as much in an hour", "figure 6.4"),
+    Statement("6.4 Compiled, an iteration of TrXL takes less time", "7.97, 5.53 s"),
     Statement(
         "6.5.1 TrXL's blocks attend to different steps ([one block here](results.md#what-the-transformer-attends-to))",
         "in the clue task, two to each command's first step, the last to the episode's; in the act task, the last to "
-        "the due command's",
+        "the due command's, the others to recent steps",
     ),
     Statement(
         "6.5.2 TrXL's first block attends to falls, later ones to a tile visited 20 steps before ([one block "
         "here](results.md#what-the-transformer-attends-to))",
-        "figure 6.7",
+        "figures 6.7, 6.8, one episode",
     ),
+    Statement("6.5.2 In Mystery Path, agents first head for the opposite side", ""),
     Statement(
         "6.5.2 GRU falls off more often in Mystery Path",
         "5.65, 4.87 times",
         claims_of("falls", MYSTERY_PATHS, GRU, PLUS, measure="num_fails"),
     ),
-    Statement("6.5.3 Agents wait for spotlights to pass", ""),
+    Statement("6.5.3 In Endless Searing Spotlights, agents wait for spotlights to pass", ""),
     Statement(
         "7.1.1 A larger TrXL stays behind GRU",
         "",
         {"capacity": in_endless(GRU, ("TrXL --trxl-dim 192", "TrXL --trxl-num-layers 3"))},
     ),
     Statement(
-        "7.1.1 A longer window does not help TrXL",
-        "384, 512 steps explored",
+        "7.1.1 A window of 256 steps is long enough for TrXL",
+        "384, 512 explored, no result told",
         {
             "window": Claim(
                 "Endless-MortarMayhem-v0-20M", ("TrXL+ --trxl-memory-length 512",), PLUS, expects_difference=False
             )
         },
     ),
-    Statement("7.1.1 TrXL gets to 5 commands in a row, 15 in all, GRU has to look back 386 steps", "figure 7.1"),
+    Statement(
+        "7.1.1 TrXL gets to 5 commands in a row, 15 in all, and looks back 124 steps; GRU 386, fewer than TrXL could",
+        "figure 7.1",
+    ),
     Statement(
         "7.1.2 Estimating the ground truth helps TrXL",
         "50 (unstable, 20 to 50), 18 commands",
@@ -393,7 +405,7 @@ def verdict(claim: Claim, pairs: list[Comparison]) -> Verdict:
     ):
         if found.p_value < LEVEL:
             return found
-    return Verdict("not decided", interval=pairs[0].interval if len(pairs) == 1 else None)
+    return Verdict("not decided", interval=pairs[0].interval if len(pairs) == claim.times == 1 else None)
 
 
 def aim_of(name: str) -> float | None:
@@ -467,14 +479,21 @@ def finished(config: Config, plans: list[learning.Plan], results: dict) -> list[
     return [results[plan.command] for plan in plans if results[plan.command] is not None]
 
 
+def share_that_holds(texts: list[str]) -> str:
+    """Return in which of a statement's rows it holds, by their verdicts: all, some or none; open if none is decided."""
+    held = [text in HOLDING for text in texts]
+    if any(held):
+        return "all" if all(held) else "some"
+    return "none" if set(texts) & set(FAILING) else "open"
+
+
 def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, Verdict]) -> None:
-    """Print a row for each claim with a verdict, then one for each statement that was not run, and how many there are.
+    """Print how many rows there are, a row for each claim with a verdict, and one for each statement that was not run.
 
     runs: of each claim that was asked for, by its agents.
     """
     stars = dict(zip(verdicts, holm([each.p_value for each in verdicts.values()]), strict=True))
-    counts = Counter(found.text for found in verdicts.values())
-    tested, not_run, holding = [HEADING], [NOT_RUN], []
+    tested, not_run, shares, lacks = [HEADING], [NOT_RUN], Counter(), 0
     for statement in STATEMENTS:
         said = statement.text, statement.thesis  # once, above rows that say the same of other tasks
         names = [name for name in statement.claims if name in verdicts]
@@ -482,20 +501,25 @@ def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, V
             tested.append(row(name, runs[name], str(verdicts[name]) + " \\*" * stars[name], said))
             said = "", ""
         if names:
-            held = [verdicts[name].text in ("holds", "not contradicted") for name in names]
-            holding.append("all" if all(held) else "some" if any(held) else "none")
+            shares[share_that_holds([verdicts[name].text for name in names])] += 1
         lacking = [f"`{name}`" for name in statement.claims if name in runs and name not in verdicts]
         # What no claim was made of has a row all the same, unless only some claims were asked for.
         if lacking or (not statement.claims and runs.keys() == CLAIMS.keys()):
             not_run.append(f"| {' | '.join([statement.text, statement.thesis, ', '.join(lacking)])} |")
-            counts["not run"] += len(lacking) or 1
+            lacks += len(lacking) or 1
+    counts = Counter(found.text for found in verdicts.values())
+    hold, fail = (sum(counts[text] for text in texts) for texts in (HOLDING, FAILING))
+    print(
+        f"Of {shares.total()} statements tested, {shares['all']} hold in all their rows and {shares['some']} in some; "
+        f"of the others, {shares['none']} do not hold, {shares['open']} are not decided or not learned."
+    )
+    print(
+        f"Of {counts.total()} rows tested, {hold} hold and {fail} do not ({sum(stars.values())} with a star), "
+        f"{counts['not decided']} are not decided, {counts['not learned']} not learned. {lacks} more were not run."
+    )
     for table in (tested, not_run):
         if table[1:]:
             print("\n".join(table))
-    summary = ", ".join(f"{count} {text}" for text, count in counts.most_common())
-    shares = ", ".join(f"{holding.count(share)} in {share}" for share in ("all", "some", "none"))
-    print(f"\nOf {len(holding)} statements tested, so many hold in their rows: {shares}.")
-    print(f"Of {counts.total()} rows: {summary}. With a star: {sum(stars.values())}.")
 
 
 def main(config: Config) -> None:

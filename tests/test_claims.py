@@ -237,7 +237,7 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     (row,) = (line for line in told.splitlines() if line.endswith(" | `normalized-gradients` (`--target-kl None`) |"))
     start = "| 7.2 Normalized advantages make gradients over 12 times larger | 0.38, 0.02"
     assert row.startswith(f"{start} | GRU, norm adv minibatch: {cells[1]} | GRU: {cells[0]} | ")
-    assert told.splitlines()[-1].startswith("Of 1 rows: 1 ")
+    assert "Of 1 rows tested, " in told
     claims.main(config)
     assert "trained" not in capsys.readouterr().out
 
@@ -245,7 +245,7 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     told = capsys.readouterr().out
     assert "trained" not in told
     assert f"\n| not run | thesis | `--claims` |\n|---|---|---|\n{start} | `normalized-gradients` |\n" in told
-    assert told.splitlines()[-1].startswith("Of 1 rows: 1 not run.")
+    assert told.splitlines()[1].endswith(" 1 more were not run.")
 
 
 def test_unknown_claim():
@@ -265,7 +265,10 @@ def test_what_is_learned_is_judged_by_all_runs_without_memory(monkeypatch, capsy
 
     monkeypatch.setattr(learning, "result_of", result_of)
     claims.main(claims.Config(claims=("query-position-gru",), report=True))
-    assert f"Of 1 rows: 1 {text}." in capsys.readouterr().out
+    counts = [
+        f"{int(text == each)} {'are ' * (each == 'not decided')}{each}" for each in ("not decided", "not learned")
+    ]
+    assert f"Of 1 rows tested, 0 hold and 0 do not (0 with a star), {', '.join(counts)}." in capsys.readouterr().out
 
 
 def test_a_statement_stands_once_above_its_claims():
@@ -282,32 +285,47 @@ def test_rows_of_one_statement(monkeypatch, capsys):
     names = [f"falls-{task}" for task in ("MysteryPath-Grid-v0", "MysteryPath-v0")]
     claims.main(claims.Config(claims=tuple(names), report=True))
     cells = "GRU: 0.50±0.00 | TrXL+: 0.50±0.00 | 3 | not learned"
-    assert capsys.readouterr().out.splitlines()[3:5] == [
+    assert capsys.readouterr().out.splitlines()[5:7] == [
         f"| 6.5.2 GRU falls off more often in Mystery Path | 5.65, 4.87 times | {cells} | `{names[0]}` |",
         f"|  |  | {cells} | `{names[1]}` |",
     ]
 
 
-def test_statements_hold_in_all_or_some_of_their_rows(monkeypatch, capsys):
+def test_in_how_many_rows_statements_hold(monkeypatch, capsys):
+    """Of two rows of each of four statements; the fifth has one."""
     curve = np.array([100]), np.full((1, 4, 1), 0.5)
-    run = RunLog("", {"total_timesteps": 3e6}, {"eval/success": curve, "eval/carried_out": curve})
+    scores = {f"eval/{name}": curve for name in ("success", "carried_out", "num_fails", "return")}
+    run = RunLog("", {"total_timesteps": 3e6}, scores | {"losses/grad_norm": curve})
     monkeypatch.setattr(learning, "result_of", lambda config, plan: run)
-    on_grid = {True: claims.Verdict("holds", 0.01), False: claims.Verdict("not decided")}
-    monkeypatch.setattr(claims, "judge", lambda claim, *_: on_grid["Grid" in claim.task])
-    tasks = ("MortarMayhem-v0", "MortarMayhem-Grid-v0", "MysteryPath-Grid-v0", "SearingSpotlights-v0")
-    claims.main(claims.Config(claims=tuple(f"memory-{task}" for task in tasks), report=True))
-    statements = capsys.readouterr().out.splitlines()[-2]
-    assert statements == "Of 3 statements tested, so many hold in their rows: 1 in all, 1 in some, 1 in none."
+    verdicts = {
+        "memory-MortarMayhem-Grid-v0": claims.Verdict("holds", 1e-5),
+        "memory-MortarMayhem-v0": claims.Verdict("holds", 0.04),
+        "memory-MysteryPath-Grid-v0": claims.Verdict("holds", 0.04),
+        "memory-MysteryPath-v0": claims.Verdict("does not hold", 0.04),
+        "memory-MortarMayhemB-Grid-v0": claims.Verdict("not decided"),
+        "memory-flat-list": claims.Verdict("does not hold", 1e-4),
+        "falls-MysteryPath-Grid-v0": claims.Verdict("not decided"),
+        "falls-MysteryPath-v0": claims.Verdict("not learned"),
+        "encodings": claims.Verdict("not contradicted"),
+    }
+    found = {id(claims.CLAIMS[name]): verdict for name, verdict in verdicts.items()}
+    monkeypatch.setattr(claims, "judge", lambda claim, *_: found[id(claim)])
+    claims.main(claims.Config(claims=tuple(verdicts), report=True))
+    assert capsys.readouterr().out.splitlines()[:2] == [
+        "Of 5 statements tested, 2 hold in all their rows and 1 in some; of the others, 1 do not hold, 1 are not "
+        "decided or not learned.",
+        "Of 9 rows tested, 4 hold and 2 do not (2 with a star), 2 are not decided, 1 not learned. 0 more were not run.",
+    ]
 
 
 def test_statements_without_runs_have_a_row(monkeypatch, capsys):
     monkeypatch.setattr(learning, "result_of", lambda config, plan: None)
     claims.main(claims.Config(report=True))
-    _, head, _, *rows, _, statements, summary = capsys.readouterr().out.splitlines()
+    statements, rows_tested, _, head, _, *rows = capsys.readouterr().out.splitlines()
     assert head == "| not run | thesis | `--claims` |"
     assert len(rows) == len(claims.STATEMENTS)
-    assert statements == "Of 0 statements tested, so many hold in their rows: 0 in all, 0 in some, 0 in none."
+    assert statements.startswith("Of 0 statements tested, 0 hold in all their rows and 0 in some; ")
     assert rows[0].endswith("|  | `memory-MortarMayhem-Grid-v0`, `memory-MortarMayhem-v0` |")
     assert rows[-1].startswith("| 7.2 In BossFight,")
     count = len(claims.CLAIMS) + sum(not statement.claims for statement in claims.STATEMENTS)
-    assert summary == f"Of {count} rows: {count} not run. With a star: 0."
+    assert rows_tested.endswith(f" {count} more were not run.")
