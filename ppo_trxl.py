@@ -93,7 +93,7 @@ class Args(RunArgs):
     target_kl: PositiveFloat | None = None
     """end the update at a minibatch whose approximate KL divergence from the rollout's policy exceeds this (above 0)"""
     optimizer: Literal["adamw", "muon"] = "adamw"
-    """muon: Muon for the matrices between hidden layers, AdamW for all other weights"""
+    """muon: Muon for the matrices between hidden layers, at three times the rate; AdamW for all other weights"""
     init_lr: UnitInterval = 2.75e-4
     """initial learning rate"""
     final_lr: UnitInterval = 1.0e-5
@@ -188,13 +188,13 @@ def train(args: Args, run: Run) -> None:
         rollout.returns = rollout.advantages + rollout.values
         if args.norm_adv == "batch":
             rollout.advantages = normalize(rollout.advantages)
-        step_logs, memory = update(agent, run.optimizers, rollout, ent_coef, args)
+        step_logs, state = update(agent, run.optimizers, rollout, ent_coef, args)
         if args.refresh_memory:
-            run.carry.memory = agent.memory.carry(memory)  # the next rollout goes on with what was recomputed
+            run.carry.memory = agent.memory.carry(state)  # the next rollout goes on with what was recomputed
         logs = mean_logs(step_logs, rollout.values, rollout.returns)
         updated = time.perf_counter()  # numbers were read: now a GPU has done the update, too
 
-        del rollout, memory  # before the next one is collected: one at a time is in memory
+        del rollout, state  # before the next one is collected: one at a time is in memory
         logs |= {"charts/learning_rate": lr, "charts/entropy_coefficient": ent_coef}
         run.step = global_step + batch_size
         end_iteration(args, run, logs, episodes, (began, collected, updated))  # evaluates, logs, saves
@@ -221,11 +221,11 @@ class Rollout:
     log_probs: Tensor  # (T, N, A)
     values: Tensor  # (T, N)
     rewards: Tensor  # (T, N)
-    terminated: Tensor  # (T, N) the step ended its episode
+    terminated: Tensor  # (T, N) the step ended its episode, other than by a time limit
     truncated: Tensor  # (T, N) the step ended its episode by a time limit
     truncation_values: Tensor  # (T, N) value of the final observation, 0 where not bootstrapped
     initial_memory: dict[str, Tensor]  # what the memory began with, for --refresh-memory
-    memory: MemoryState  # what the memory stored of each step
+    memory_state: MemoryState  # what the memory stored of each step
     last_value: Tensor | None = None  # (N,) of the observation after the last step
     first_occurrence: Tensor | None = None  # (T * N,) flat index of the first equal observation; see `encode`
     advantages: Tensor | None = None  # (T, N)
@@ -239,9 +239,9 @@ class Rollout:
     @classmethod
     def allocate(cls, num_steps: int, carry: Carry, agent: Agent) -> Rollout:
         """Make a rollout of zeros on the agent's device."""
-        obs, branches = as_tensors(carry.obs, next(agent.parameters()).device), len(agent.heads.nvec)
-        first = next(iter(obs.values()))
-        zeros = partial(torch.zeros, num_steps, len(first), device=first.device)
+        device, num_envs = next(agent.parameters()).device, len(next(iter(carry.obs.values())))
+        obs, branches = as_tensors(carry.obs, torch.device("cpu")), len(agent.heads.nvec)
+        zeros = partial(torch.zeros, num_steps, num_envs, device=device)
         return cls(
             obs={name: zeros(*part.shape[1:], dtype=part.dtype) for name, part in obs.items()},
             ground_truth=None if carry.ground_truth is None else zeros(carry.ground_truth.shape[1]),
@@ -253,7 +253,7 @@ class Rollout:
             truncated=zeros(dtype=torch.bool),
             truncation_values=zeros(),
             initial_memory=carry.memory,
-            memory=agent.memory.begin_rollout(carry.memory, num_steps),
+            memory_state=agent.memory.begin_rollout(carry.memory, num_steps),
         )
 
 
@@ -269,13 +269,14 @@ def collect(
     obs, ground_truth, episodes = carry.obs, carry.ground_truth, defaultdict(list)
     with torch.autocast(device.type, torch.bfloat16, enabled=args.amp):
         rollout = Rollout.allocate(args.num_steps, carry, agent)
+        state = rollout.memory_state
         for t in range(args.num_steps):
             for name, part in obs.items():
                 rollout.obs[name][t] = torch.from_numpy(part)
             if ground_truth is not None:
                 rollout.ground_truth[t] = torch.from_numpy(ground_truth)
             step_obs = {name: part[t] for name, part in rollout.obs.items()}
-            actions, rollout.log_probs[t], rollout.values[t] = agent.get_action_and_value(step_obs, rollout.memory)
+            actions, rollout.log_probs[t], rollout.values[t] = agent.get_action_and_value(step_obs, state)
             rollout.actions[t] = actions
 
             with torch.autocast(device.type, enabled=False):  # for environments that compute with torch
@@ -285,39 +286,38 @@ def collect(
             rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
             if args.bootstrap_truncated and truncated.any():
                 final = as_tensors(final_observations(obs, infos, truncated), device)
-                value = agent.get_value(final, rollout.memory)  # with the memory of the episode that ended
+                value = agent.get_value(final, state)  # with the memory of the episode that ended
                 rollout.truncation_values[t] = value.where(rollout.truncated[t] & ~rollout.terminated[t], 0.0)
-            agent.memory.reset(rollout.memory, torch.as_tensor(done))
+            agent.memory.reset(state, torch.as_tensor(done))
             ground_truth = ground_truth_of(infos, args, ground_truth)
             add_ended(episodes, infos, done)
-        rollout.last_value = agent.get_value(as_tensors(obs, device), rollout.memory)
+        rollout.last_value = agent.get_value(as_tensors(obs, device), state)
     rollout.first_occurrence = first_occurrences(rollout.obs)  # for speed: on a CPU, equal images are encoded once
-    return rollout, Carry(obs, ground_truth, agent.memory.carry(rollout.memory)), episodes
+    return rollout, Carry(obs, ground_truth, agent.memory.carry(state)), episodes
 
 
 def update(
     agent: Agent, optimizers: list[torch.optim.Optimizer], rollout: Rollout, ent_coef: float, args: Args
 ) -> tuple[list[dict[str, Tensor]], MemoryState]:
-    """Learn from the rollout for some epochs; return what to log of each minibatch, and the memory last recomputed."""
-    pieces = agent.memory.cut(rollout.done.cpu())
-    step_logs = []
+    """Learn from the rollout for some epochs; return what to log of each minibatch, and the memory's last state."""
+    pieces, step_logs = agent.memory.cut(rollout.done.cpu()), []
     for epoch in range(args.update_epochs):
         if args.refresh_memory and epoch > 0:
-            rollout = replace(rollout, memory=refreshed_memory(agent, rollout, args))
+            rollout = replace(rollout, memory_state=refreshed_state(agent, rollout, args))
         for minibatch in pieces.minibatches(args.num_minibatches):
             loss, logs = ppo_loss(agent, rollout, minibatch, ent_coef, args)
             step_logs.append(logs)
             if args.target_kl is not None and len(step_logs) > 1:  # the first one's is 0: nothing has been learned yet
                 kl = np.mean(all_gather(logs["approx_kl"].item()))  # all processes stop together
                 if kl > args.target_kl:
-                    return step_logs, rollout.memory
+                    return step_logs, rollout.memory_state
             agent.zero_grad()
             loss.backward()
             average_gradients(agent, int(minibatch.length.sum()))  # over processes, if there are several
             logs["grad_norm"] = clip_gradients(agent, args)
             for optimizer in optimizers:
                 optimizer.step()
-    return step_logs, rollout.memory
+    return step_logs, rollout.memory_state
 
 
 def ppo_loss(
@@ -334,7 +334,7 @@ def ppo_loss(
         x = encode(agent.encoder, rollout.obs, index, rollout.first_occurrence)  # (B, I)
         lists = {name: gather(rollout.obs[name]) for name in agent.heads.scores}  # each (B, rows, columns)
         actions = gather(rollout.actions)  # (B, A)
-        policy, log_probs, values, features = agent.evaluate_actions(x, lists, actions, minibatch, rollout.memory)
+        policy, log_probs, values, features = agent.evaluate_actions(x, lists, actions, minibatch, rollout.memory_state)
     log_ratio = log_probs - gather(rollout.log_probs)  # (B, A)
     advantages, old_values, returns = gather(rollout.advantages), gather(rollout.values), gather(rollout.returns)
     if args.norm_adv == "minibatch":
@@ -363,7 +363,7 @@ def ppo_loss(
 
 
 @torch.no_grad()
-def refreshed_memory(agent: Agent, rollout: Rollout, args: Args) -> MemoryState:
+def refreshed_state(agent: Agent, rollout: Rollout, args: Args) -> MemoryState:
     """Return what the memory would have stored with the current weights (§7.1.4; Kapturowski et al., 2019).
 
     What the rollout began with is not recomputed. With the weights that acted, it is the same, up to rounding.
@@ -372,8 +372,7 @@ def refreshed_memory(agent: Agent, rollout: Rollout, args: Args) -> MemoryState:
     with torch.autocast(rollout.values.device.type, torch.bfloat16, enabled=args.amp):
         state = agent.memory.begin_rollout(rollout.initial_memory, len(done))
         for t in range(len(done)):
-            x = agent.encoder({name: part[t] for name, part in rollout.obs.items()})
-            _, hidden = agent.memory.step(state, x)
+            _, hidden = agent.memory.step(state, agent.encoder({name: part[t] for name, part in rollout.obs.items()}))
             agent.memory.advance(state, hidden)
             agent.memory.reset(state, done[t])
     return state
@@ -388,7 +387,8 @@ def clip_gradients(agent: Agent, args: Args) -> Tensor:
     for name, parameter in agent.named_parameters():
         part = name.partition(".")[0]
         groups[part if args.auxiliary_detach and part in agent.auxiliary else "agent"].append(parameter)
-    return {part: nn.utils.clip_grad_norm_(group, args.max_grad_norm) for part, group in groups.items()}["agent"]
+    norms = {part: nn.utils.clip_grad_norm_(group, args.max_grad_norm) for part, group in groups.items()}  # in place
+    return norms["agent"]
 
 
 # ---- 3 PPO ----
@@ -894,8 +894,9 @@ class Heads(nn.Module):
         with torch.autocast(x.device.type, enabled=False):  # --amp: bfloat16 is too coarse for values and log-ratios
             x = x.float()
             # Normalized scores keep all weights well above 0: a row that is not read yet still gets a gradient.
-            weights = {name: F.layer_norm(score(x), [score[-1].out_features]) for name, score in self.scores.items()}
-            read = [(weight.softmax(-1)[:, None] @ obs[name])[:, 0] for name, weight in weights.items()]
+            scores = {name: score(x) for name, score in self.scores.items()}  # each (B, rows)
+            weights = {name: F.layer_norm(each, each.shape[-1:]).softmax(-1) for name, each in scores.items()}
+            read = [(weight[:, None] @ obs[name])[:, 0] for name, weight in weights.items()]  # each (B, columns)
             features = F.relu(self.trunk(torch.cat([x, *read], -1)))
             logits = self.policy(features).split(self.nvec, -1)  # A parts
             policy = [Categorical(logits=part, validate_args=False) for part in logits]
@@ -1019,8 +1020,7 @@ def setup(args: Args) -> Run:
     run, obs, infos = prepare(args, Path(__file__).stem)
     with report_out_of_memory(args, run.device, run.envs.single_observation_space):
         run.agent = make_agent(Agent, run.envs, infos, args).to(run.device)
-        memory = run.agent.memory.initial(run.envs.num_envs, run.device)
-        run.carry = Carry(obs, ground_truth_of(infos, args), memory)
+        run.carry = Carry(obs, ground_truth_of(infos, args), run.agent.memory.initial(run.envs.num_envs, run.device))
         Rollout.allocate(args.num_steps, run.carry, run.agent)  # does it fit?
     run.optimizers = make_optimizers(run.agent, args)
     return open_run(args, run)  # sets all of it to the checkpoint's state, if there is one

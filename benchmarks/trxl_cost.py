@@ -58,7 +58,7 @@ def kept_for_backward(run, args: ppo_trxl.Args) -> list[torch.Tensor]:
     minibatch = next(memory.cut(rollout.done).minibatches(args.num_minibatches))
     x = torch.randn(int(minibatch.length.sum()), memory.width, requires_grad=True)
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        memory.unroll(rollout.memory, x, minibatch)
+        memory.unroll(rollout.memory_state, x, minibatch)
     weights = {parameter.untyped_storage().data_ptr() for parameter in memory.parameters()}
     return [tensor for tensor in kept if tensor.untyped_storage().data_ptr() not in weights]
 

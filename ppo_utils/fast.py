@@ -158,10 +158,10 @@ class Muon(torch.optim.Muon):
                 momentum = self.state[weight]["momentum_buffer"]
                 momentum.lerp_(weight.grad, 1 - group["momentum"])
                 directions.append(weight.grad.lerp(momentum, group["momentum"]))
-            steps = orthogonalize(torch.stack(directions), group["ns_coefficients"], group["ns_steps"])
-            rate = group["lr"] * 0.2 * math.sqrt(max(rows, columns))  # a step's root mean square is 0.2, as AdamW's
-            for weight, step in zip(members, steps, strict=True):
-                weight.mul_(1 - group["lr"] * group["weight_decay"]).sub_(step, alpha=rate)
+            updates = orthogonalize(torch.stack(directions), group["ns_coefficients"], group["ns_steps"])
+            rate = group["lr"] * 0.2 * math.sqrt(max(rows, columns))  # an update's root mean square is 0.2, as AdamW's
+            for weight, update in zip(members, updates, strict=True):
+                weight.mul_(1 - group["lr"] * group["weight_decay"]).sub_(update, alpha=rate)
 
 
 def orthogonalize(matrices: Tensor, coefficients: tuple[float, float, float], steps: int) -> Tensor:

@@ -91,7 +91,8 @@ class RunArgs:
     save_model: bool = False
     """write model.pt to the run folder when training ends"""
     load_model: str | None = None
-    """start from the weights in this model.pt or checkpoint; optimizer and step count start afresh"""
+    """start from the weights in this model.pt or checkpoint; optimizer, step count and scale of --norm-reward start
+    afresh"""
     resume: str | None = None
     """continue the run in this folder from its last checkpoint; only --total-timesteps may change, to a larger value"""
     checkpoint_interval: NonNegativeInt = 50
@@ -112,7 +113,7 @@ class RunArgs:
     obs_type: Literal["pixels", "grayscale", "vector"] = "pixels"
     """what a Memory Gym environment shows: images in color or in gray, or vectors of what can be seen on them"""
     frame_stack: NonNegativeInt = 0
-    """observe the last K images, in grayscale, or the last K vectors (0: the current one, in color)"""
+    """observe the last K images, in grayscale, or the last K vectors (0: the current one, as --obs-type has it)"""
     attend_commands: bool = False
     """read the list of commands of Mortar Mayhem's act tasks row by row, by attention after the memory"""
     step_encoding: bool = False
@@ -123,7 +124,7 @@ class RunArgs:
     """cover the image with a translucent white layer in which moving spotlights leave holes (thesis §7.2)"""
     vector_frequencies: bounded(int, 0, 16) | None = None
     """also observe Fourier features of vectors with entries from 0 to 1, at this many frequencies (None: 4 in Mystery
-    Path, else 0)"""
+    Path with --obs-type vector, else 0)"""
 
     eval_interval: NonNegativeInt = 0
     """iterations between evaluations on other levels, with another one at the end (0: no evaluations)"""

@@ -1,4 +1,7 @@
-"""Running moments of what all processes see, and the scale of rewards that is made of them."""
+"""Running moments of what all processes see, and the scale of rewards that is made of them.
+
+Shape letters: T steps of a rollout, N environments.
+"""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +11,7 @@ from torch import Tensor
 
 from ppo_utils.processes import all_gather
 
-LARGEST_REWARD = 10.0  # after scaling, as Stable-Baselines3's VecNormalize and CleanRL clip it
+LARGEST_REWARD = 10.0  # as Stable-Baselines3's VecNormalize and CleanRL clip it
 
 
 @dataclass
@@ -45,7 +48,7 @@ class ReturnScale(Moments):
     discounted: Tensor | None = None  # (N,) that sum in the present episodes
 
     def scale(self, rewards: Tensor, done: Tensor, gamma: float) -> Tensor:
-        """Take in a rollout's rewards (T, N), and return them scaled: as they are, as long as all returns are equal."""
+        """Take in a rollout's rewards (T, N); return them scaled and clipped, only clipped while returns are equal."""
         returns = torch.zeros_like(rewards)
         discounted = torch.zeros_like(rewards[0]) if self.discounted is None else self.discounted.to(rewards.device)
         for t in range(len(rewards)):

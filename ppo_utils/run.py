@@ -1,7 +1,4 @@
-"""What a training run consists of, from its environments to its progress bar.
-
-Shape letters: T steps of a rollout, N environments.
-"""
+"""What a training run consists of, from its environments to its progress bar."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -26,6 +23,7 @@ class Run:
     checkpoint: dict[str, Any] | None  # that --resume goes on from
     envs: gym.vector.VectorEnv
     started_in: Path  # the folder
+    threads: int  # of torch, when this began
     agent: nn.Module | None = None
     optimizers: list[torch.optim.Optimizer] = field(default_factory=list)
     carry: Any = None  # a script's Carry, what the next rollout goes on with

@@ -95,8 +95,6 @@ def prepare(args: RunArgs, script: str) -> tuple[Run, dict[str, np.ndarray], dic
     torch.backends.cudnn.deterministic = True
     # The momentum of idle units fills with numbers below 1e-38, which slow a CPU down several times: they become 0.
     torch.set_flush_denormal(True)  # for this thread, and those that it starts
-    if args.obs_type == "vector" and "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(1)  # of small networks, threads mostly wait for each other
     device = torch.device("cpu")
     if torch.cuda.is_available() and args.cuda:
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
@@ -109,20 +107,23 @@ def prepare(args: RunArgs, script: str) -> tuple[Run, dict[str, np.ndarray], dic
         envs = training_envs(args, checkpoint)
     with report_out_of_memory(args, device, envs.single_observation_space):
         obs, infos = envs.reset()
-    return Run(script, device, checkpoint, envs, started_in), obs, infos
+    threads = torch.get_num_threads()
+    if "OMP_NUM_THREADS" not in os.environ and not any(part.ndim == 4 for part in obs.values()):  # no images
+        torch.set_num_threads(1)  # the networks are small: threads would mostly wait for each other
+    torch.manual_seed(args.seed)  # of the weights: the same in all processes, whatever the environments drew
+    return Run(script, device, checkpoint, envs, started_in, threads), obs, infos
 
 
 def seed_process(args: RunArgs, checkpoint: dict[str, Any] | None) -> None:
-    """Seed torch's generator, for the weights, and those of NumPy and Python, for environments of other packages.
+    """Seed the generators of torch, NumPy and Python, for environments of other packages.
 
-    All processes begin with the same weights. Environments of another process, and those of a run that goes on, which
-    begin new episodes, must not repeat the episodes that the first process began with.
+    Those of another process, and those of a run that goes on, which begin new episodes, must not repeat the episodes
+    that the first process began with.
     """
     seed_generators(args.seed)
     if (rank := rank_and_size()[0]) or checkpoint is not None:
         entropy = [args.seed, rank, 0 if checkpoint is None else checkpoint["step"]]
         seed_generators(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
-        torch.manual_seed(args.seed)
 
 
 @contextlib.contextmanager
@@ -368,6 +369,7 @@ def close(run: Run) -> None:
     """Close all files, environments and connections, the others too if one raises."""
     with contextlib.ExitStack() as stack:  # from the last to the first
         stack.callback(leave_processes)
+        stack.callback(torch.set_num_threads, run.threads)
         stack.enter_context(contextlib.suppress(OSError))  # that a file cannot be written was reported before
         for each in filter(None, (run.lock, run.writer, run.envs, run.eval_envs, run.bar)):
             stack.callback(each.close)

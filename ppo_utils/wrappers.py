@@ -443,12 +443,11 @@ def branch_sizes(space: gym.Space) -> np.ndarray:
     elif isinstance(space, gym.spaces.MultiDiscrete) and space.nvec.ndim == 1 and space.nvec.size:
         sizes = space.nvec
     else:
-        sizes = np.zeros(0, int)
-    if sizes.size and sum(sizes.tolist()) <= MOST_ENTRIES:
-        return sizes
-    if sizes.size:
+        kinds = "Discrete or one-dimensional MultiDiscrete"
+        raise ValueError(f"the action space {brief(space)} is not supported; use {kinds}")
+    if sum(sizes.tolist()) > MOST_ENTRIES:
         raise ValueError(f"the action space {brief(space)} is not supported; it has more than {MOST_ENTRIES:,} actions")
-    raise ValueError(f"the action space {brief(space)} is not supported; use Discrete or one-dimensional MultiDiscrete")
+    return sizes
 
 
 def one_hot(choices: np.ndarray, sizes: np.ndarray) -> np.ndarray:

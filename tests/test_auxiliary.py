@@ -59,7 +59,7 @@ def test_the_losses_are_means_over_real_steps(played, script):
     obs = {name: part.flatten(0, 1)[order] for name, part in run.rollout.obs.items()}
     with torch.no_grad():
         actions = run.rollout.actions.flatten(0, 1)[order]
-        features = run.agent.evaluate_actions(run.agent.encoder(obs), obs, actions, pieces, run.rollout.memory)[3]
+        features = run.agent.evaluate_actions(run.agent.encoder(obs), obs, actions, pieces, run.rollout.memory_state)[3]
         drawn = torch.sigmoid(run.agent.decoder(features))
         wanted = obs["visual_observation"] / 255
         truths = run.rollout.ground_truth.flatten(0, 1)[order]

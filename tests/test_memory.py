@@ -57,7 +57,9 @@ def recompute(run):
     index = pieces.flat_index()
     obs = {name: part.flatten(0, 1)[index] for name, part in rollout.obs.items()}
     actions = rollout.actions.flatten(0, 1)[index]
-    _, log_probs, values, _ = run.agent.evaluate_actions(run.agent.encoder(obs), obs, actions, pieces, rollout.memory)
+    _, log_probs, values, _ = run.agent.evaluate_actions(
+        run.agent.encoder(obs), obs, actions, pieces, rollout.memory_state
+    )
     return index, (log_probs - rollout.log_probs.flatten(0, 1)[index]).exp(), values
 
 
@@ -106,7 +108,7 @@ def test_ratio_is_nearly_one_in_bfloat16(played, memory):
 def test_ratio_error_sees_a_broken_memory(played, memory):
     """Guards the guard: with what the memory stored lost, the ratios are off."""
     _, run, *_ = played(iterations=3, weights_scale=3.0, env_id="CueRecall-v0", **memory)
-    for part in tree_leaves(vars(run.rollout.memory)):
+    for part in tree_leaves(vars(run.rollout.memory_state)):
         if isinstance(part, torch.Tensor) and part.is_floating_point():
             part.zero_()
     assert (recompute(run)[1] - 1).abs().max() > 1e-4
@@ -238,7 +240,7 @@ def test_a_long_episode_takes_no_more_memory_than_a_short_one(played):
         collect(ppo_gru, run, args)
     assert run.envs.episode_lengths[0] == 300
     assert storage() == before
-    assert run.rollout.memory.hidden.shape == (1, 1, 4)
+    assert run.rollout.memory_state.hidden.shape == (1, 1, 4)
 
 
 @pytest.mark.parametrize("encoding", ["absolute", "relative", "learned", "none"])
@@ -251,7 +253,7 @@ def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(pl
     run.carry.memory["episode_step"] += 4900
 
     def storage():
-        state, memory = run.rollout.memory, run.agent.memory
+        state, memory = run.rollout.memory_state, run.agent.memory
         parts = (*state.keys, *state.values, state.hidden, state.row_step, *memory.buffers(), *memory.parameters())
         return [part.shape for part in parts]
 
@@ -259,7 +261,7 @@ def test_a_long_episode_takes_no_more_of_the_window_s_memory_than_a_short_one(pl
     for _ in range(3):
         collect(ppo_trxl, run, args)
         assert recompute(run)[1].sub(1).abs().max() < 1e-5
-    assert run.rollout.memory.episode_step > 5000
+    assert run.rollout.memory_state.episode_step > 5000
     assert storage() == before
 
 
@@ -385,8 +387,9 @@ def test_acting_and_learning_ask_no_device_for_numbers(played, monkeypatch, memo
         return parts | tree_map(lambda part: part.to("meta") if isinstance(part, torch.Tensor) else part, move)
 
     rollout = run.rollout
-    memory = type(rollout.memory)(**moved(vars(rollout.memory)))
-    rollout = script.Rollout(**moved({**vars(rollout), "memory": None}) | {"memory": memory, "first_occurrence": None})
+    memory = type(rollout.memory_state)(**moved(vars(rollout.memory_state)))
+    parts = {**vars(rollout), "memory_state": None, "first_occurrence": None}
+    rollout = script.Rollout(**moved(parts) | {"memory_state": memory})
     obs = {name: part[0] for name, part in rollout.obs.items()}
     with NoQuestions(), torch.no_grad():
         state = agent.memory.begin_rollout(agent.memory.carry(memory), 16)
@@ -423,8 +426,8 @@ REFRESHED = {
 def test_refreshing_with_the_weights_that_acted_changes_nothing(played, ends, amp, memory):
     args, run, *_ = played(iterations=3, amp=amp, **REFRESHED[ends], **memory)
     assert ends == "neither" or getattr(run.rollout, ends).any()
-    before = vars(run.rollout.memory)
-    refreshed = memory.get("script", ppo_gru).refreshed_memory(run.agent, run.rollout, args)
+    before = vars(run.rollout.memory_state)
+    refreshed = memory.get("script", ppo_gru).refreshed_state(run.agent, run.rollout, args)
     for name, now in vars(refreshed).items():
         same = [each.equal(other) for each, other in zip(now, before[name], strict=True)] if name != "now" else [True]
         assert all(same), f"{name}: does carry hold all that a rollout begins with?"
@@ -432,10 +435,10 @@ def test_refreshing_with_the_weights_that_acted_changes_nothing(played, ends, am
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_the_next_rollout_goes_on_with_the_refreshed_memory(tiny, opened, script, monkeypatch):
-    refreshed, refreshed_memory = [], script.refreshed_memory
+def test_the_next_rollout_goes_on_with_the_refreshed_state(tiny, opened, script, monkeypatch):
+    refreshed, refreshed_state = [], script.refreshed_state
     monkeypatch.setattr(
-        script, "refreshed_memory", lambda *given: refreshed.append(refreshed_memory(*given)) or refreshed[-1]
+        script, "refreshed_state", lambda *given: refreshed.append(refreshed_state(*given)) or refreshed[-1]
     )
     args = tiny(script, env_id="CueRecall-v0", refresh_memory=True, update_epochs=3, total_timesteps=64, init_lr=1e-2)
     run = opened(script, args)
@@ -446,7 +449,7 @@ def test_the_next_rollout_goes_on_with_the_refreshed_memory(tiny, opened, script
 
 
 @each_memory(WITH_MEMORY)
-def test_a_refreshed_memory_is_that_of_a_rollout_with_the_present_weights(played, memory):
+def test_a_refreshed_state_is_that_of_a_rollout_with_the_present_weights(played, memory):
     """The same observations and actions, played again from the same start by the changed agent."""
     script = memory.get("script", ppo_gru)
     args, run, *_ = played(iterations=3, weights_scale=2.0, env_id="CueRecall-v0", **memory)
@@ -454,7 +457,7 @@ def test_a_refreshed_memory_is_that_of_a_rollout_with_the_present_weights(played
     with torch.no_grad():
         for parameter in agent.parameters():
             parameter.mul_(0.9)
-    rollout.memory = script.refreshed_memory(agent, rollout, args)
+    rollout.memory_state = script.refreshed_state(agent, rollout, args)
     _, ratio, values = recompute(run)
     assert not torch.allclose(ratio, torch.ones(()), atol=1e-4), "the policy is another one"
     # Steps one by one, from what was stored before the rollout.
@@ -471,8 +474,8 @@ def test_a_refreshed_memory_is_that_of_a_rollout_with_the_present_weights(played
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_memory_is_refreshed_before_every_epoch_but_the_first(tiny, script, monkeypatch):
-    calls, refreshed_memory, ppo_loss = [], script.refreshed_memory, script.ppo_loss
-    monkeypatch.setattr(script, "refreshed_memory", lambda *given: calls.append("r") or refreshed_memory(*given))
+    calls, refreshed_state, ppo_loss = [], script.refreshed_state, script.ppo_loss
+    monkeypatch.setattr(script, "refreshed_state", lambda *given: calls.append("r") or refreshed_state(*given))
     monkeypatch.setattr(script, "ppo_loss", lambda *given: calls.append("l") or ppo_loss(*given))
     changes = {"env_id": "CueRecall-v0", "update_epochs": 3, "total_timesteps": 64}
     script.main(tiny(script, refresh_memory=True, **changes))
@@ -490,7 +493,7 @@ def test_memory_is_refreshed_before_every_epoch_but_the_first(tiny, script, monk
         (True, ppo_trxl, {"trxl_memory_gradient": True, "trxl_segment_length": 3}),
     ],
 )
-def test_which_updates_read_refreshed_memory(tiny, opened, reads, script, changes):
+def test_which_updates_read_refreshed_state(tiny, opened, reads, script, changes):
     """As docs/memory.md says: the first update is another one where it reads what was refreshed."""
     changes |= {"env_id": "Endless-MortarMayhem-v0", "obs_type": "vector", "total_timesteps": 64, "init_lr": 1e-2}
     weights = []

@@ -8,6 +8,7 @@ import re
 import signal
 from pathlib import Path
 
+import cue_recall
 import numpy as np
 import programs
 import pytest
@@ -148,7 +149,15 @@ def test_processes_play_shares_of_the_lanes_of_one(tiny, monkeypatch):
 
 
 def test_processes_have_the_same_weights_and_other_global_generators(tiny, monkeypatch):
-    drawn = []
+    """Also where resets draw as many of torch's numbers as the seed says."""
+    reset, drawn = cue_recall.CueRecall.reset, []
+
+    def draw(env, **given):
+        results = reset(env, **given)
+        torch.rand(int(env.np_random.integers(1, 100)))
+        return results
+
+    monkeypatch.setattr(cue_recall.CueRecall, "reset", draw)
     for rank in (0, 1, 2):
         monkeypatch.setattr(runs, "rank_and_size", lambda rank=rank: (rank, 3))
         runs.prepare(tiny(env_id="CueRecall-v0"), "ppo_gru")[0].envs.close()

@@ -143,17 +143,28 @@ def test_numbers_that_slow_a_cpu_down_are_zero(tiny):
 
 
 @pytest.mark.parametrize(
-    ("obs_type", "variable", "threads"), [("vector", None, 1), ("vector", "2", 2), ("pixels", None, 2)]
+    ("changes", "variable", "threads"),
+    [
+        ({"env_id": "MysteryPath-Grid-v0", "obs_type": "vector"}, None, 1),
+        ({"env_id": "MysteryPath-Grid-v0", "obs_type": "vector"}, "2", 2),
+        ({"env_id": "MysteryPath-Grid-v0"}, None, 2),
+        ({"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector", "attend_commands": True}, None, 1),
+        ({"env_id": "CartPole-v1"}, None, 1),
+        ({"env_id": "Image-v0", "obs_type": "vector"}, None, 2),
+    ],
 )
-def test_threads_of_a_training(tiny, monkeypatch, obs_type, variable, threads):
+def test_threads_of_a_training(tiny, opened, monkeypatch, changes, variable, threads):
+    """One without images, unless told otherwise; afterwards as many as before."""
     monkeypatch.delenv("OMP_NUM_THREADS")
     if variable:
         monkeypatch.setenv("OMP_NUM_THREADS", variable)
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        ppo_gru.main(tiny(env_id="MysteryPath-Grid-v0", obs_type=obs_type))
+        run = opened(ppo_gru, tiny(**changes))
         assert torch.get_num_threads() == threads
+        runs.close(run)
+        assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
 
