@@ -7,12 +7,13 @@ with 1 if there is a fault. Agents of other packages: docs/check_your_memory.md.
 """
 
 import argparse
+import re
 import sys
 from pathlib import Path
 
 import torch
 
-from ppo_utils.checkpoints import import_script
+from ppo_utils.checkpoints import SCRIPT_NAME, import_script
 from ppo_utils.memory_adapters import ScriptAdapter
 from ppo_utils.memory_check import check
 from ppo_utils.runs import parse_args
@@ -20,14 +21,21 @@ from ppo_utils.terminal import one_line_exit, open_streams
 
 
 def main() -> int:
-    """Check what the command line says. Raises ValueError for a script or flags that make no agent."""
+    """Check what the command line says.
+
+    Raises ValueError, OSError or ImportError for a script or flags that make no agent.
+    """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("script", help="a script, ppo_NAME.py, in this folder")
+    parser.add_argument("script", help="a script, ppo_NAME.py")
     parser.add_argument("flags", nargs=argparse.REMAINDER, help="its flags")
     given = parser.parse_args()
-    if not Path(given.script).is_file():
-        raise ValueError(f"there is no {given.script}; give a script of this folder, such as ppo_gru.py")
-    script = import_script({"script": Path(given.script).stem}, given.script)
+    path = Path(given.script).resolve()
+    if not path.is_file():
+        raise ValueError(f"there is no {given.script}; give a script, such as ppo_gru.py")
+    if not re.fullmatch(SCRIPT_NAME, path.stem):
+        raise ValueError(f"the script {given.script} must be named ppo_NAME.py")
+    sys.path.insert(0, str(path.parent))  # before this folder, which may have a script of the same name
+    script = import_script({"script": path.stem}, given.script)
     args = parse_args(script.Args, script.PRESETS, given.flags)
     torch.manual_seed(args.seed)
     report = check(ScriptAdapter(script, args))
@@ -37,5 +45,5 @@ def main() -> int:
 
 if __name__ == "__main__":
     open_streams()
-    with one_line_exit(ValueError):
+    with one_line_exit(ValueError, OSError, ImportError):
         sys.exit(main())

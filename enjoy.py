@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from ppo_utils.checkpoints import import_script, load_weights, read_model, saved_args
 from ppo_utils.environments import as_tensors, envs_for, is_memory_gym, with_options, wrappers_of
 from ppo_utils.errors import RunError
-from ppo_utils.evaluation import first_after, make_agent
+from ppo_utils.evaluation import MEMORY_STEPS, first_after, make_agent, with_room
 from ppo_utils.flags import bounded, check_bounds
 from ppo_utils.infos import final_numbers, ground_truths
 from ppo_utils.terminal import one_line_exit, open_streams
@@ -182,13 +182,14 @@ def play(
     if family:
         episode.events |= {"failure": [], family.shown: []}
     obs, infos = envs.reset(seed=seed)
-    memory = agent.memory.begin_rollout(agent.memory.initial(1, torch.device("cpu")), max_steps)
+    memory = agent.memory.begin_rollout(agent.memory.initial(1, torch.device("cpu")), MEMORY_STEPS)
     while not episode.finished and len(episode.actions) < max_steps:
         for name, frame in views(envs, obs, stacked).items():
             episode.film(name, frame)
         if family or agent.estimator is not None:  # of other packages, training has seen that there is one
             episode.truth.append(np.asarray(ground_truths(infos)[0]))
         step = len(episode.actions)
+        memory = with_room(agent.memory, memory, step)
         if family and family.shows(envs.unwrapped.state):
             episode.events[family.shown].append(step)
         with watching(agent, memory, episode):

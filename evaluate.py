@@ -13,8 +13,7 @@ number: where 70 % of the episodes succeed, the middle half has hardly a failure
 The 95 % interval is that of a bootstrap that resamples whole seeds: how far the IQM would move with other seeds. Of
 three seeds it is about the range of their IQMs. A single seed has none. The thesis' bootstrap is stratified (6.1.2).
 
-Shape letters: R seeds (training runs) of an agent, M levels, E episodes on each, I iterations of a run, P points of a
-curve, B bootstrap resamples.
+Shape letters: R seeds (training runs) of an agent, M levels, E episodes on each.
 """
 
 import itertools
@@ -59,7 +58,8 @@ class Config:
     """the first of these levels (default: the first after those of the training; an agent that trained without a limit,
     --num-levels 0, has met none of the numbered levels)"""
     new_levels: bool = False
-    """of these levels, play only those that begin as none of the training's does: two levels may have the same path"""
+    """of these levels, play only those that begin as none of the training's does: two levels may have the same path;
+    not with --env-options, under which the training's are others"""
     repeats: PositiveInt = 3
     """how often to play each level"""
     max_steps: PositiveInt = 10_000
@@ -155,7 +155,8 @@ def title_of(args: dict[str, Any], config: Config) -> str:
     first = first_after(training) if config.start_level is None else config.start_level
     trained_on = " (of its training)" if are_trained_on(training, first, config.levels) else ""
     if config.new_levels:
-        which = f"{config.levels} levels from {first} on that begin as none of the training's does"
+        trained = f"{training.start_level} to {first_after(training) - 1}"
+        which = f"{config.levels} levels from {first} on that begin as none of the levels {trained} does"
     else:
         which = f"levels {first} to {first + config.levels - 1}{trained_on}"
     levels = f"{which}, {config.repeats} times each"
@@ -214,6 +215,10 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
 def check_numbers(config: Config) -> None:
     """Raise ValueError for the first number that cannot work."""
     check_bounds(config)
+    if config.new_levels and config.env_options is not None:
+        raise ValueError(
+            "--new-levels and --env-options: which levels are new is known for the training's options only"
+        )
     if (episodes := config.levels * config.repeats) > MOST_EPISODES:
         raise ValueError(f"--levels x --repeats is {episodes}; at most {MOST_EPISODES} are played")
 

@@ -19,7 +19,7 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
-from learning import FIRST_TEST_LEVEL, Training
+from learning import FIRST_TEST_LEVEL, TEST_LEVELS
 from memory_gym_envs.players import choices, player
 from suites import FULL, SMALL, Task
 from tables import BOUNDS, scored_levels
@@ -39,9 +39,7 @@ def scripted_player(envs: gym.vector.VectorEnv, rng: np.random.Generator) -> np.
     return player(envs)
 
 
-def play(
-    task: Task, actions_of: Callable, levels: int = Training.test_levels, max_steps: int = MAX_STEPS
-) -> np.ndarray:
+def play(task: Task, actions_of: Callable, levels: int = TEST_LEVELS, max_steps: int = MAX_STEPS) -> np.ndarray:
     """Return a player's score on each test level, (M,)."""
     envs = gym.make_vec(task.env_id, num_envs=levels, obs_type="vector", max_episode_steps=max_steps)
     envs.reset(seed=FIRST_TEST_LEVEL, options=task.options)
@@ -56,7 +54,7 @@ def play(
     return scores
 
 
-def main(out: Path = BOUNDS, levels: int = Training.test_levels, max_steps: int = MAX_STEPS) -> None:
+def main(out: Path = BOUNDS, levels: int = TEST_LEVELS, max_steps: int = MAX_STEPS) -> None:
     """Write the mean scores over levels.
 
     Args:

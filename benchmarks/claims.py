@@ -86,6 +86,7 @@ class Claim:
     flags: str = ""  # of all agents
     expects_difference: bool = True
     times: float = 1.0  # how many times as high as each of `lower`
+    needs_memory: bool = True  # else nobody has to score higher than an agent without memory
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -93,7 +94,7 @@ class Claim:
         return (*self.higher, *self.lower)
 
     def plans(self, config: learning.Training, agent: str) -> list[learning.Plan]:
-        """Return the trainings of one of the agents, one for each seed."""
+        """Return the trainings of one of the agents, or of another one, one for each seed."""
         flags = f"{agent} {self.flags}".strip()
         return [learning.plan(config, TASKS[self.task], flags, seed) for seed in config.seeds]
 
@@ -322,14 +323,18 @@ STATEMENTS = (
     Statement(
         "7.2 Normalized advantages make GRU worse in Searing Spotlights, all visible",
         "1.00, 0.43",
-        claims_of("normalized", "all-visible", GRU, (NORMALIZED,), flags="--target-kl None"),
+        claims_of("normalized", "all-visible", GRU, (NORMALIZED,), flags="--target-kl None", needs_memory=False),
     ),
     Statement(
         "7.2 With normalized advantages, no memory is ahead of GRU",
         "0.96, 0.43",
         {
             "normalized-no-memory": Claim(
-                "all-visible", ("no memory --norm-adv minibatch",), (NORMALIZED,), flags="--target-kl None"
+                "all-visible",
+                ("no memory --norm-adv minibatch",),
+                (NORMALIZED,),
+                flags="--target-kl None",
+                needs_memory=False,
             )
         },
     ),
@@ -338,7 +343,13 @@ STATEMENTS = (
         "0.38, 0.02",
         {
             "normalized-gradients": Claim(
-                "all-visible", (NORMALIZED,), GRU, gradient_norm, flags="--target-kl None", times=12
+                "all-visible",
+                (NORMALIZED,),
+                GRU,
+                gradient_norm,
+                flags="--target-kl None",
+                times=12,
+                needs_memory=False,
             )
         },
     ),
@@ -405,7 +416,8 @@ def verdict(claim: Claim, pairs: list[Comparison]) -> Verdict:
     ):
         if found.p_value < LEVEL:
             return found
-    return Verdict("not decided", interval=pairs[0].interval if len(pairs) == claim.times == 1 else None)
+    is_plain = len(pairs) == 1 and claim.times == 1
+    return Verdict("not decided", interval=pairs[0].interval if is_plain else None)
 
 
 def aim_of(name: str) -> float | None:
@@ -418,7 +430,7 @@ def aim_of(name: str) -> float | None:
 def is_learned(claim: Claim, runs: dict[str, list[RunLog]], without: list[RunLog]) -> bool:
     """Return whether an agent of the claim has its share of the aim, and any scores higher than one without memory.
 
-    Where falls are counted, all need the share. The latter is asked if there are runs of that; if an agent without
+    Where falls are counted, all need the share. The latter is asked if there are seeds of that; if an agent without
     memory is one of the claim's, another has to pass it.
     """
     name, aim = TASKS[claim.task].score, aim_of(claim.task)
@@ -463,7 +475,7 @@ def row(name: str, runs: dict[str, list[RunLog]], found: str, said: tuple[str, s
 
 
 def judge(claim: Claim, runs: dict[str, list[RunLog]], without: list[RunLog]) -> Verdict:
-    """Return the verdict on a claim, from the runs of its agents and, if they are there, of one without memory."""
+    """Return the verdict on a claim, from the runs of its agents and, if it needs memory, of one without."""
     if not is_learned(claim, runs, without):
         return Verdict("not learned")
     numbers = {agent: claim.numbers(members) for agent, members in runs.items()}
@@ -532,18 +544,18 @@ def main(config: Config) -> None:
         raise SystemExit(f"there is no claim {unknown[0]}; there are {', '.join(CLAIMS)}")
     claims = {name: claim for name, claim in CLAIMS.items() if name in config.claims}
     plans = {name: {agent: claim.plans(config, agent) for agent in claim.agents} for name, claim in claims.items()}
+    without = {name: claim.plans(config, "no memory") if claim.needs_memory else [] for name, claim in claims.items()}
     if not config.report:
-        each_once = {plan.command: plan for agents in plans.values() for seeds in agents.values() for plan in seeds}
+        wanted = itertools.chain(*without.values(), *(seeds for agents in plans.values() for seeds in agents.values()))
+        each_once = {plan.command: plan for plan in wanted}
         learning.train_missing(config, [*each_once.values()])  # claims share runs
     results, runs, verdicts = {}, {}, {}
     for name, claim in claims.items():
         runs[name] = {agent: finished(config, seeds, results) for agent, seeds in plans[name].items()}
-        wanted, found = (sum(map(len, each.values())) for each in (plans[name], runs[name]))
-        if found < wanted:
-            continue
-        seeds = [learning.plan(config, TASKS[claim.task], "no memory", seed) for seed in config.seeds]
-        without = finished(config, seeds, results)
-        verdicts[name] = judge(claim, runs[name], without if len(without) == len(seeds) else [])
+        bases = finished(config, without[name], results)
+        wanted = [*plans[name].values(), without[name]]
+        if sum(map(len, wanted)) == sum(map(len, [*runs[name].values(), bases])):
+            verdicts[name] = judge(claim, runs[name], bases)
     print_tables(runs, verdicts)
 
 

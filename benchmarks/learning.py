@@ -55,7 +55,7 @@ from suites import AGENTS, SUITES, TASKS, Task, short
 
 ROOT = Path(__file__).parent.parent
 COMMON = "--preset laptop --save-model"  # an agent's own flags override these
-FIRST_TEST_LEVEL = 1_000_000
+FIRST_TEST_LEVEL, TEST_LEVELS = 1_000_000, 1000  # that final weights play, each once
 # Scalars that tell how an iteration's update went.
 UPDATE_CURVES = ("losses/grad_norm", "losses/entropy", "charts/gradient_steps", "charts/learning_rate")
 
@@ -69,11 +69,9 @@ class Training:
     seeds: tuple[int, ...] = (1, 2, 3)
     """a training run each"""
     jobs: PositiveInt = os.cpu_count() or 1
-    """runs at the same time; they share the cores, or have OMP_NUM_THREADS threads each if that is set"""
+    """runs at the same time; with images, they share the cores, or have OMP_NUM_THREADS threads each if that is set"""
     evaluations: PositiveInt = 20
     """at least so many evaluations of a training, at even distances, and one at its end"""
-    test_levels: PositiveInt = 1000
-    """levels that the final weights play once, from FIRST_TEST_LEVEL on"""
     folder: Path = Path("learning")
     """where the runs go"""
     results: Path = Path("learning/results")
@@ -243,7 +241,7 @@ def expected_hours(config: Training, missing: list[Plan]) -> str:
     speeds = {}
     for path in config.results.glob("*/*.json.gz"):
         with contextlib.suppress(NoCurvesError):
-            run = read_run(str(path))
+            run = read_file(str(path), path.stat().st_mtime_ns)
             if run.has_seconds():
                 speeds.setdefault(run.args["script"], []).append(run.last_step / run.seconds("iteration").sum())
     scripts = [Path(plan.command[1]).stem for plan in missing]
@@ -273,10 +271,10 @@ def steps_so_far(config: Training, plan: Plan) -> int:
     return int(float(number) * {"": 1, "k": 1e3, "M": 1e6}[unit])
 
 
-def environment(config: Training) -> dict[str, str]:
-    """Return the variables for a training or its evaluation: threads for its share of the cores."""
-    threads = str(max(1, (os.cpu_count() or 1) // config.jobs))
-    return {"OMP_NUM_THREADS": threads, **os.environ, "TQDM_MININTERVAL": "10"}
+def environment(config: Training, plan: Plan) -> dict[str, str]:
+    """Return the variables for a training or its evaluation: a thread, with images those of its share of the cores."""
+    threads = 1 if plan.args.obs_type == "vector" else max(1, (os.cpu_count() or 1) // config.jobs)
+    return {"OMP_NUM_THREADS": str(threads), **os.environ, "TQDM_MININTERVAL": "10"}
 
 
 def train(config: Training, plan: Plan) -> None:
@@ -290,7 +288,7 @@ def train(config: Training, plan: Plan) -> None:
         # In a session of its own, Ctrl-C does not reach it: `train_missing` stops it, so that it leaves a checkpoint.
         how = {
             "cwd": config.folder,
-            "env": environment(config),
+            "env": environment(config, plan),
             "stdout": output,
             "stderr": output,
             "start_new_session": True,
@@ -365,10 +363,10 @@ def test_scores(config: Training, plan: Plan, run: RunLog) -> dict[str, tuple[li
     Raises SystemExit if that fails.
     """
     scores = Path(run.path) / "test_scores.json"
-    flags = ["--start-level", FIRST_TEST_LEVEL, "--levels", config.test_levels, "--repeats", 1, "--json", scores]
+    flags = ["--start-level", FIRST_TEST_LEVEL, "--levels", TEST_LEVELS, "--repeats", 1, "--json", scores]
     flags += ["--max-steps", plan.args.eval_max_steps]
     command = [sys.executable, ROOT / "evaluate.py", Path(run.path) / "model.pt", *flags]
-    how = {"env": environment(config), "capture_output": True, "text": True, "check": False}
+    how = {"env": environment(config, plan), "capture_output": True, "text": True, "check": False}
     done = subprocess.run([str(each) for each in command], **how)
     if done.returncode:
         raise SystemExit(f"{plan}, could not be scored: {done.stderr.strip()}")
@@ -470,18 +468,24 @@ def results_of(config: Config, plans: dict[tuple[str, str, int], Plan]) -> dict[
 
 
 def write_csv(results: Path, path: Path) -> int:
-    """Write the scores of all runs to a table, a line for each evaluation, and return the number of runs."""
-    names = ("env_id", "env_options", "exp_name", "script", "seed")
+    """Write the scores of all runs to a table, a line for each evaluation, and return the number of runs.
+
+    On test levels they are those of the tables: of new levels only, where there are any.
+    """
+    names = ("env_id", "env_options", "exp_name", "script", "seed", "total_timesteps")
     files = sorted(results.glob("*/*.json.gz"))
     with path.open("w", newline="") as file:
         table = csv.writer(file)
-        table.writerow((*names, "levels", "metric", "step", "hours", "mean", "episodes"))
+        table.writerow(("run", *names, "levels", "metric", "step", "hours", "mean", "episodes"))
         for each in files:
             run = read_run(str(each))
             for curve, (steps, scores) in run.curves.items():
                 levels, _, metric = curve.partition("/")
                 if levels in ("eval", "test"):
-                    about = [run.args[name] for name in names] + [levels.replace("eval", "development"), metric]
+                    if levels == "test":
+                        scores = tables.final_scores(metric, [run])
+                    about = [each.name.removesuffix(".json.gz"), *(run.args[name] for name in names)]
+                    about += [levels.replace("eval", "development"), metric]
                     hours = run.hours(np.asarray(steps)) if run.has_seconds() else np.full(len(steps), math.nan)
                     for step, hour, score in zip(steps, hours, scores, strict=True):
                         table.writerow((*about, step, f"{hour:.4f}", f"{score.mean():.6g}", score.size))

@@ -75,7 +75,8 @@ def final_scores(name: str, runs: list[RunLog], every_level: bool = False) -> np
     levels = "test" if are_tested(name, runs) else "eval"
     scores = align([run.curves[f"{levels}/{name}"] for run in runs])[1][-1]
     args = runs[0].args
-    if every_level or levels == "eval" or (args.get("start_level"), args.get("num_levels")) != ("0", "100000"):
+    first, count = (int(args.get(name, 0)) for name in ("start_level", "num_levels"))
+    if every_level or levels == "eval" or not count or first + count > 100_000:  # of those, it is not known
         return scores
     new = scored_levels(args["env_id"], json.loads(args["env_options"]))
     return scores if new is None else scores[:, new]
@@ -136,7 +137,7 @@ class Comparison:
 
     errors: float
     p_value: float  # two-sided
-    interval: tuple[float, float] = (-math.inf, math.inf)  # of the difference, at a level of 1 - LEVEL
+    interval: tuple[float, float] | None = None  # of the difference, at a level of 1 - LEVEL; None for a single seed
 
     @property
     def is_ahead(self) -> bool:

@@ -31,7 +31,7 @@ AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, low rate", "TrXL+")
 PATH_TASKS = ("MysteryPath-Grid-v0", "MysteryPath-v0")  # tasks that have the same paths
 LONG_TASK = PATH_TASKS[1]  # of which one agent has a longer training, too
 LEVELS = 100_000  # that are trained on by default
-TEST_LEVELS = learning.Training.test_levels
+TEST_LEVELS = learning.TEST_LEVELS
 COUNTED = {  # what the table calls them: id, reset options
     **{name: (task.env_id, json.dumps(task.options)) for name, task in TASKS.items() if task.best_score is not None},
     "quickstart": (ppo_gru.Args().env_id, ppo_gru.QUICKSTART["env_options"]),

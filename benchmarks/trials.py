@@ -49,16 +49,16 @@ def curve_of(run: RunLog) -> Curve:
 
 def add(agent: str, run: RunLog) -> None:
     """Append a run's curve to the file. Raises SystemExit for a run that the tables could not show, or have already."""
-    whose = task, _, seed = run.args["env_id"], agent, run.args["seed"]
+    task, seed = run.args["env_id"], run.args["seed"]
     if task not in COLUMNS:
         raise SystemExit(f"the tables have {', '.join(COLUMNS)}, not {task}")
     if f"eval/{TASKS[task].score}" not in run.curves:
         raise SystemExit(f"{run.path} has no evaluations; train with --eval-interval")
     with TRIALS.open(newline="") as file:
-        if any((row["task"], row["agent"], row["seed"]) == whose for row in csv.DictReader(file)):
+        if any((row["task"], row["agent"], row["seed"]) == (task, agent, seed) for row in csv.DictReader(file)):
             raise SystemExit(f"there is a trial of {agent} in {task} with seed {seed} already")
     with TRIALS.open("a", newline="") as file:
-        rows = ((*whose, step, f"{score:.4f}") for step, score in curve_of(run).items())
+        rows = ((task, agent, seed, step, f"{score:.4f}") for step, score in curve_of(run).items())
         csv.writer(file, lineterminator="\n").writerows(rows)
 
 

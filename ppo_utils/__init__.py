@@ -8,6 +8,7 @@
     video          videos of the first environment
     infos          what a training counts and logs of their infos
     evaluation     scores on levels that are not trained on
+    moments        running moments, and the scale of rewards that is made of them
     scores         interquartile means and their table; which runs are seeds of one agent
     run_logs       what runs have logged, read again
     curves         pictures and tables of that

@@ -239,7 +239,7 @@ def gradients_stay(case: Case) -> Finding | None:
     if not obs.requires_grad:
         return None
     if not outputs.requires_grad or gradient(outputs.sum(), obs) is None:
-        return Finding("gradient", False, "the update has no gradient to any observation") if wanted else None
+        return None if wanted is None else Finding("gradient", False, "the update has no gradient to any observation")
     weights = torch.randn(outputs.shape[-1])
     for lane in range(LANES):
         others = gradient((outputs[:, lane] * weights).sum(), obs)
@@ -263,7 +263,10 @@ def gradients_stay(case: Case) -> Finding | None:
     for lane, (reach, longest) in enumerate(zip(reaches.tolist(), steps.amax(0).tolist(), strict=True)):
         if wanted is not None and reach != min(wanted, longest):
             says = f"the policy's gradient reaches {reach} steps back in lane {lane}, not {min(wanted, longest)}"
-            return Finding("gradient", False, f"{says}: what is further away is hardly learned")
+            effect = (
+                "what is further away is hardly learned" if reach < wanted else "it is not cut where it is meant to be"
+            )
+            return Finding("gradient", False, f"{says}: {effect}")
     return Finding("gradient", True, "none crosses the end of an episode or reaches another lane")
 
 

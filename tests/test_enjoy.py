@@ -816,6 +816,7 @@ def test_other_environments_in_the_browser(browser, saved, tmp_path):
     saved(env_id="CartPole-v1")
     (page,) = page_of()["episodes"]
     browser.get((tmp_path / "page.html").as_uri())
+    wait_until(browser, lambda _: browser.find_elements("css selector", ".probabilities .xtick"))
     assert [each.text for each in browser.find_elements("css selector", ".probabilities .xtick")] == ["0", "1"]
     assert step_of(browser) == (page["steps"] - 1) // 2
     assert trace(browser, 1, "x", 1) == [*range(page["steps"])]

@@ -720,6 +720,9 @@ def test_other_levels(agents):
     assert ", levels 1 to 4, " in scores_of(agents, start_level=1)[1], "below the first level of the training"
     without_levels = arguments(num_levels=0, start_level=100)
     assert ", levels 90 to 139, " in evaluate.title_of(without_levels, evaluate.Config(start_level=90))
+    trained = arguments(num_levels=10, start_level=5)
+    new = evaluate.title_of(trained, evaluate.Config(start_level=90, levels=4, new_levels=True))
+    assert ", 4 levels from 90 on that begin as none of the levels 5 to 14 does, " in new
 
 
 @pytest.mark.parametrize(
@@ -852,6 +855,7 @@ BAD = {
     "notes.txt": "notes.txt is cut short, or neither a model nor a checkpoint",
     "MODEL --levels 0": "--levels is 0; it must be 1 or more",
     "MODEL --levels 1000000000": "--levels x --repeats is 3000000000; at most 100000 are played",
+    "MODEL --new-levels --env-options {}": "--new-levels and --env-options: which levels are new is known for",
     "MODEL --seed 99999999999999999999": r"--seed is 99999999999999999999; it must be below 2 \*\* 63",
     "cut.pt": "cut.pt is cut short, or neither a model nor a checkpoint",
     "MODEL --max-steps 0": "--max-steps is 0",

@@ -71,7 +71,6 @@ def test_an_agent_may_have_further_flags(tmp_path):
         ({"seeds": (1, 2, 1)}, "--seeds is 1 2 1; give at least one, and each once"),
         ({"jobs": 0}, "--jobs is 0; it must be 1 or more"),
         ({"evaluations": 0}, "--evaluations is 0; it must be 1 or more"),
-        ({"test_levels": 0}, "--test-levels is 0; it must be 1 or more"),
         ({"steps": 0}, "--steps is 0; it must be 1 or more"),
         ({"steps": 2**63}, r"--steps is 9223372036854775808; it must be below 2 \*\* 63"),
     ],
@@ -134,6 +133,7 @@ def test_an_agent_goes_on_with_no_other_run(tmp_path):
 
 
 def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(learning, "TEST_LEVELS", 5)
     small = "--num-envs 4 --num-steps 32 --num-minibatches 2 --hidden-size 8 --eval-levels 2"
     agent, task = f"GRU --refresh-memory {small}", learning.TASKS["mortar-mayhem"]
     config = learning.Config(
@@ -142,7 +142,6 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
         steps=3 * 128,
         seeds=(1,),
         evaluations=3,
-        test_levels=5,
         folder=tmp_path / "learning",
         results=tmp_path / "results",
         out=tmp_path / "curves.png",
@@ -295,16 +294,19 @@ def test_a_run_without_a_score_at_its_end_is_no_result(last, tested, tmp_path, m
 
 def test_runs_share_the_cores_unless_told_how_many_threads_to_have(tmp_path, monkeypatch):
     config = learning.Config(jobs=1, folder=tmp_path)
-    plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", 1)
-    plan = replace(plan, command=(sys.executable, "-c", "import os; print(os.environ['OMP_NUM_THREADS'])"))
+    command = (sys.executable, "-c", "import os; print(os.environ['OMP_NUM_THREADS'])")
+    vectors, pixels = (
+        replace(learning.plan(config, learning.TASKS["mortar-mayhem"], f"GRU --obs-type {kind}", 1), command=command)
+        for kind in ("vector", "pixels")
+    )
     monkeypatch.setattr(os, "cpu_count", lambda: 7)
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    learning.train(config, plan)
+    learning.train(config, vectors)
     monkeypatch.delenv("OMP_NUM_THREADS")
-    learning.train(config, plan)
-    learning.train(replace(config, jobs=2), plan)
-    (log,) = tmp_path.glob("*.log")
-    assert log.read_text() == "3\n7\n3\n"
+    learning.train(config, vectors)
+    learning.train(config, pixels)
+    learning.train(replace(config, jobs=2), pixels)
+    assert [log.read_text() for log in sorted(tmp_path.glob("*.log"))] == ["7\n3\n", "3\n1\n"]
 
 
 def test_a_log_tells_how_far_its_training_is(tmp_path):
@@ -323,12 +325,16 @@ def test_a_log_tells_how_far_its_training_is(tmp_path):
     assert learning.steps_so_far(config, longer) == 0, "nor has a longer training"
 
 
-def test_results_as_one_table(tmp_path, capsys):
+def test_results_as_one_table(tmp_path, capsys, monkeypatch):
+    """Of the test levels, those that were not trained on: the first four."""
+    new = np.arange(7) < 4
+    monkeypatch.setattr(learning.tables, "read_new_levels", lambda: {("X-v0", "{}"): new})
     args = {"env_id": "X-v0", "env_options": "{}", "exp_name": "GRU", "script": "ppo_gru", "seed": "3"}
+    args |= {"total_timesteps": "300", "start_level": "0", "num_levels": "1000"}
     scores = np.broadcast_to(np.reshape([1, 2, 3], (3, 1, 1)), (3, 4, 2))
     run = RunLog("", args, {"eval/return": (np.array([100, 200, 300]), scores)})
     seconds = {name: (np.array([100, 200, 300]), np.full((3, 1, 1), 36.0)) for name in SECONDS.values()}
-    test = {"test/return": ([300], np.full((1, 7, 1), 2.5))}
+    test = {"test/return": ([300], np.where(new, 2.0, 9.0)[None, :, None])}
     (tmp_path / "X-v0").mkdir()
     learning.write_run(replace(run, curves=run.curves | seconds | test), f"{tmp_path}/X-v0/run.json.gz")
     unmeasured = {"eval/return": (np.array([100]), scores[:1])}  # as earlier versions did, which had no seconds
@@ -336,12 +342,12 @@ def test_results_as_one_table(tmp_path, capsys):
     learning.main(learning.Config(results=tmp_path, csv=tmp_path / "all.csv"))
     assert capsys.readouterr().out == f"{tmp_path}/all.csv: the scores of 2 runs\n"
     assert (tmp_path / "all.csv").read_text().splitlines() == [
-        "env_id,env_options,exp_name,script,seed,levels,metric,step,hours,mean,episodes",
-        "X-v0,{},GRU,ppo_gru,3,development,return,100,0.0100,1,8",
-        "X-v0,{},GRU,ppo_gru,3,development,return,200,0.0200,2,8",
-        "X-v0,{},GRU,ppo_gru,3,development,return,300,0.0300,3,8",
-        "X-v0,{},GRU,ppo_gru,3,test,return,300,0.0300,2.5,7",
-        "X-v0,{},GRU,ppo_gru,4,development,return,100,nan,1,8",
+        "run,env_id,env_options,exp_name,script,seed,total_timesteps,levels,metric,step,hours,mean,episodes",
+        "run,X-v0,{},GRU,ppo_gru,3,300,development,return,100,0.0100,1,8",
+        "run,X-v0,{},GRU,ppo_gru,3,300,development,return,200,0.0200,2,8",
+        "run,X-v0,{},GRU,ppo_gru,3,300,development,return,300,0.0300,3,8",
+        "run,X-v0,{},GRU,ppo_gru,3,300,test,return,300,0.0300,2,4",
+        "unmeasured,X-v0,{},GRU,ppo_gru,4,300,development,return,100,nan,1,8",
     ]
 
 

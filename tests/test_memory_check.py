@@ -1,5 +1,6 @@
 """ppo_utils/memory_check.py: it names what is wrong in small wrong agents, and finds nothing in right ones."""
 
+import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -336,7 +337,13 @@ def test_what_a_report_says(seeded):
     assert "FAULT ratio one: the update computes something else (step 1, lane 0" in text
     assert "FAULT reset: in the update, an episode's first step is not that of a fresh agent (step 7, lane 1" in text
     assert "ok    evaluation: " in text
-    assert "reaches 0 steps back in lane 0, not 23" in str(check(CutGradient()))
+    assert "reaches 0 steps back in lane 0, not 23: what is further away is hardly learned" in str(check(CutGradient()))
+
+
+def test_a_gradient_that_reaches_further_than_is_meant(seeded):
+    adapter = Right()
+    adapter.reach = 4
+    assert "steps back in lane 0, not 4: it is not cut where it is meant to be" in str(check(adapter))
 
 
 @pytest.mark.parametrize("critic", ["own", "shared", "without memory"])
@@ -450,7 +457,21 @@ def test_the_program(arguments, code, words, capsys, monkeypatch):
 
 def test_the_program_without_a_script(monkeypatch):
     monkeypatch.setattr("sys.argv", ["check_memory.py", "ppo_lru.py"])
-    with pytest.raises(ValueError, match=r"there is no ppo_lru.py; give a script of this folder, such as ppo_gru.py"):
+    with pytest.raises(ValueError, match=r"there is no ppo_lru.py; give a script, such as ppo_gru.py"):
+        check_memory.main()
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "message"),
+    [("ppo_gru.py", ImportError, "^mine$"), ("mygru.py", ValueError, r"mygru\.py must be named ppo_NAME\.py")],
+)
+def test_the_program_checks_the_script_that_is_named(tmp_path, monkeypatch, name, error, message):
+    """Not that of the repository with the same name."""
+    (tmp_path / name).write_text("raise ImportError('mine')")
+    monkeypatch.setattr("sys.argv", ["check_memory.py", f"{tmp_path}/{name}"])
+    monkeypatch.setattr("sys.path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "ppo_gru")
+    with pytest.raises(error, match=message):
         check_memory.main()
 
 
