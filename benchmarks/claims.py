@@ -9,10 +9,10 @@ A claim compares pairs of agents: each that is said to have the higher number (A
 have the lower one (B). A pair is decided as in the tables of results (`tables.Comparison`): by Welch's t-test over
 seeds and levels. The claim holds if all of its pairs are decided its way; it does not hold if one is decided the other
 way, with its p-value multiplied by the number of pairs; else it is not decided, and of a single pair the table has the
-95 % interval of the difference. Where the thesis says that agents are no better than others, that is contradicted if
-one of them is ahead, with p as before. Where no agent of a row scores higher than those without memory, or all have
-less than a quarter of what is possible (in endless tasks, of what the thesis' transformer has; nine tenths where falls
-are counted), the task has not been learned, and there is no verdict.
+95 % interval of the difference. Where the thesis says that agents are no better than others, it does not hold if one of
+them is ahead, with p as before, and is not decided else. Where no agent of a row scores higher than those without
+memory, or all have less than a quarter of what is possible (in endless tasks, of what the thesis' transformer has; nine
+tenths where falls are counted), the task has not been learned, and there is no verdict.
 
 With so many rows, some verdicts come by chance. A star marks those that also stand at a family-wise error of 5 % (Holm,
 1979). A row of several pairs has the largest of their p-values where all of them are needed, else the smallest times
@@ -55,7 +55,6 @@ TASKS = {
     "flat-list": Task("MortarMayhemB-Grid-v0", 6_000_000),
     "small-endless": replace(suites.SMALL["endless-mortar-mayhem"], total_timesteps=3_000_000),
 }
-HOLDING, FAILING = ("holds", "not contradicted"), ("does not hold", "contradicted")  # verdicts
 # Of a task's aim, what one of a row's agents has, if the task has been learned; all of them, where falls are counted,
 # since those that fail fall for other reasons.
 SHARE, SHARE_OF_FALLS = 0.25, 0.9
@@ -406,13 +405,11 @@ def verdict(claim: Claim, pairs: list[Comparison]) -> Verdict:
     """Return the verdict on a claim, from the comparisons of its pairs."""
     above = [pair.p_value for pair in pairs if pair.errors > 0]
     below = [pair.p_value for pair in pairs if pair.errors < 0]
+    against = below if claim.expects_difference else above
     # That one pair of several is decided is as likely as Bonferroni says, that all are, as the least sure one.
-    if not claim.expects_difference:
-        found = Verdict("contradicted", min(1, len(pairs) * min(above, default=1)))
-        return found if found.p_value < LEVEL else Verdict("not contradicted")
     for found in (
-        Verdict("does not hold", min(1, len(pairs) * min(below, default=1))),
-        Verdict("holds", max(above) if len(above) == len(pairs) else 1),
+        Verdict("does not hold", min(1, len(pairs) * min(against, default=1))),
+        Verdict("holds", max(above) if claim.expects_difference and len(above) == len(pairs) else 1),
     ):
         if found.p_value < LEVEL:
             return found
@@ -493,10 +490,9 @@ def finished(config: Config, plans: list[learning.Plan], results: dict) -> list[
 
 def share_that_holds(texts: list[str]) -> str:
     """Return in which of a statement's rows it holds, by their verdicts: all, some or none; open if none is decided."""
-    held = [text in HOLDING for text in texts]
-    if any(held):
-        return "all" if all(held) else "some"
-    return "none" if set(texts) & set(FAILING) else "open"
+    if "holds" in texts:
+        return "all" if set(texts) == {"holds"} else "some"
+    return "none" if "does not hold" in texts else "open"
 
 
 def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, Verdict]) -> None:
@@ -520,13 +516,13 @@ def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, V
             not_run.append(f"| {' | '.join([statement.text, statement.thesis, ', '.join(lacking)])} |")
             lacks += len(lacking) or 1
     counts = Counter(found.text for found in verdicts.values())
-    hold, fail = (sum(counts[text] for text in texts) for texts in (HOLDING, FAILING))
     print(
         f"Of {shares.total()} statements tested, {shares['all']} hold in all their rows and {shares['some']} in some; "
         f"of the others, {shares['none']} do not hold, {shares['open']} are not decided or not learned."
     )
     print(
-        f"Of {counts.total()} rows tested, {hold} hold and {fail} do not ({sum(stars.values())} with a star), "
+        f"Of {counts.total()} rows tested, {counts['holds']} hold and {counts['does not hold']} do not "
+        f"({sum(stars.values())} with a star), "
         f"{counts['not decided']} are not decided, {counts['not learned']} not learned. {lacks} more were not run."
     )
     for table in (tested, not_run):

@@ -51,8 +51,9 @@ class Config:
 
 def times_trained_on(args: RunArgs, levels: int) -> np.ndarray:
     """Return how often each test level's path was among a training's levels, (M,)."""
-    trained_on = Counter(beginnings(args, args.start_level, args.num_levels))
-    return np.array([trained_on[each] for each in beginnings(args, learning.FIRST_TEST_LEVEL, levels)])
+    task = args.env_id, args.env_options
+    trained_on = Counter(beginnings(*task, args.start_level, args.num_levels))
+    return np.array([trained_on[each] for each in beginnings(*task, learning.FIRST_TEST_LEVEL, levels)])
 
 
 def print_counts() -> None:
@@ -62,10 +63,9 @@ def print_counts() -> None:
     """
     lines = ["task,new"]
     print("| task | different levels of the first 100,000 | new of 1,000 test levels |\n|---|---:|---:|")
-    for name, (env_id, options) in COUNTED.items():
-        args = ppo_gru.Args(env_id=env_id, env_options=options)
-        trained_on = set(beginnings(args, 0, LEVELS))
-        new = [each not in trained_on for each in beginnings(args, learning.FIRST_TEST_LEVEL, TEST_LEVELS)]
+    for name, task in COUNTED.items():
+        trained_on = set(beginnings(*task, 0, LEVELS))
+        new = [each not in trained_on for each in beginnings(*task, learning.FIRST_TEST_LEVEL, TEST_LEVELS)]
         print(f"| {name} | {len(trained_on):,} | {sum(new):,} |")
         if name in TASKS and not all(new):
             lines.append(f"{name},{''.join(str(int(each)) for each in new)}")

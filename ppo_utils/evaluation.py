@@ -11,12 +11,11 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
-from ppo_utils.environments import as_tensors, envs_for
+from ppo_utils.environments import as_tensors, is_memory_gym, make_envs, parse_options
 from ppo_utils.errors import report_unusable_policy
 from ppo_utils.flags import RunArgs
 from ppo_utils.infos import final_numbers, ground_truth_of
 from ppo_utils.terminal import tell
-from ppo_utils.wrappers import WRAPPERS
 
 REPEATS = 3  # times that each level is played
 AT_ONCE = 1000  # levels whose beginnings are looked at
@@ -46,15 +45,15 @@ def evaluation_levels(
     return [level for level in numbers for _ in range(repeats)]
 
 
-def beginnings(args: RunArgs, first: int, count: int) -> list[bytes]:
+@functools.cache  # 100,000 levels take half a minute, and agents share them
+def beginnings(env_id: str, env_options: str, first: int, count: int) -> tuple[bytes, ...]:
     """Return what so many levels from `first` on begin with: all that `oracle()` of the Memory Gym environments tells.
 
     That is path, commands, coins and places. Raises ValueError for other environments.
     """
-    plain = {"obs_type": "vector", "num_levels": 0, "asynchronous": False, **dict.fromkeys(WRAPPERS, 0)}
-    envs = envs_for(args, AT_ONCE, **plain)
-    if not hasattr(envs.unwrapped, "oracle"):
-        raise ValueError(f"--new-levels: {args.env_id} does not tell what a level holds")
+    if not is_memory_gym(env_id):
+        raise ValueError(f"--new-levels: {env_id} does not tell what a level holds")
+    envs = make_envs(env_id, AT_ONCE, options=parse_options(env_id, env_options), obs_type="vector")
     found = []
     while len(found) < count:
         envs.reset(seed=[first + len(found) + lane for lane in range(AT_ONCE)])
@@ -62,7 +61,7 @@ def beginnings(args: RunArgs, first: int, count: int) -> list[bytes]:
         # Paths and sequences are as long as the longest of these; -1 follows their end.
         found += [b"|".join(np.trim_zeros(part[lane] + 1, "b").tobytes() for part in told) for lane in range(AT_ONCE)]
     envs.close()
-    return found[:count]
+    return tuple(found[:count])
 
 
 def new_levels(args: RunArgs, count: int, first: int) -> list[int]:
@@ -72,10 +71,11 @@ def new_levels(args: RunArgs, count: int, first: int) -> list[int]:
     """
     if not args.num_levels:
         raise ValueError("--new-levels: with --num-levels 0, a training may have met any level")
-    trained_on = set(beginnings(args, args.start_level, args.num_levels))
+    task = args.env_id, args.env_options
+    trained_on = set(beginnings(*task, args.start_level, args.num_levels))
     found, at = [], first
     while len(found) < count:
-        fresh = [at + n for n, each in enumerate(beginnings(args, at, AT_ONCE)) if each not in trained_on]
+        fresh = [at + n for n, each in enumerate(beginnings(*task, at, AT_ONCE)) if each not in trained_on]
         if not fresh:
             raise ValueError(f"--new-levels: levels {at} to {at + AT_ONCE - 1} all begin as some of the training do")
         found, at = found + fresh, at + AT_ONCE

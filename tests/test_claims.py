@@ -33,8 +33,9 @@ def pair(errors, p_value=0.01):
         ([pair(3), pair(-2.5, 0.02), pair(-3, 0.01)], True, "does not hold", 0.03),  # one of three is enough
         ([pair(3), pair(-2.1, 0.04)], True, "not decided", 1.0),  # one of two is that low in 8 % of all cases
         ([pair(2.0, 0.06)], True, "not decided", 1.0),
-        ([pair(-3), pair(2.1, 0.02)], False, "contradicted", 0.04),
-        ([pair(-3), pair(2.1, 0.04)], False, "not contradicted", 1.0),
+        ([pair(-3), pair(2.1, 0.02)], False, "does not hold", 0.04),
+        ([pair(-3), pair(2.1, 0.04)], False, "not decided", 1.0),
+        ([pair(3, 0.06)], False, "not decided", 1.0),
     ],
 )
 def test_verdicts(pairs, expects_difference, text, p_value):
@@ -298,7 +299,7 @@ def test_rows_of_one_statement(monkeypatch, capsys):
 
 
 def test_in_how_many_rows_statements_hold(monkeypatch, capsys):
-    """Of two rows of each of four statements; the fifth has one."""
+    """Of two rows of each of four statements."""
     curve = np.array([100]), np.full((1, 4, 1), 0.5)
     scores = {f"eval/{name}": curve for name in ("success", "carried_out", "num_fails", "return")}
     run = RunLog("", {"total_timesteps": 3e6}, scores | {"losses/grad_norm": curve})
@@ -312,15 +313,14 @@ def test_in_how_many_rows_statements_hold(monkeypatch, capsys):
         "memory-flat-list": claims.Verdict("does not hold", 1e-4),
         "falls-MysteryPath-Grid-v0": claims.Verdict("not decided"),
         "falls-MysteryPath-v0": claims.Verdict("not learned"),
-        "encodings": claims.Verdict("not contradicted"),
     }
     found = {id(claims.CLAIMS[name]): verdict for name, verdict in verdicts.items()}
     monkeypatch.setattr(claims, "judge", lambda claim, *_: found[id(claim)])
     claims.main(claims.Config(claims=tuple(verdicts), report=True))
     assert capsys.readouterr().out.splitlines()[:2] == [
-        "Of 5 statements tested, 2 hold in all their rows and 1 in some; of the others, 1 do not hold, 1 are not "
+        "Of 4 statements tested, 1 hold in all their rows and 1 in some; of the others, 1 do not hold, 1 are not "
         "decided or not learned.",
-        "Of 9 rows tested, 4 hold and 2 do not (2 with a star), 2 are not decided, 1 not learned. 0 more were not run.",
+        "Of 8 rows tested, 3 hold and 2 do not (2 with a star), 2 are not decided, 1 not learned. 0 more were not run.",
     ]
 
 

@@ -184,8 +184,8 @@ def test_counts_of_levels(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(tables, "NEW_LEVELS", tmp_path / "new_levels.csv")
     monkeypatch.setattr(trained_paths, "COUNTED", {name: trained_paths.COUNTED[name] for name in ("quickstart",)})
     trained_paths.main(trained_paths.Config(count=True))
-    args = ppo_gru.Args(env_options=ppo_gru.QUICKSTART["env_options"])
-    seen = set(evaluation.beginnings(args, 0, 100))
-    new = [each for each in evaluation.beginnings(args, learning.FIRST_TEST_LEVEL, 50) if each not in seen]
+    task = "MortarMayhem-Grid-v0", ppo_gru.QUICKSTART["env_options"]
+    seen = set(evaluation.beginnings(*task, 0, 100))
+    new = [each for each in evaluation.beginnings(*task, learning.FIRST_TEST_LEVEL, 50) if each not in seen]
     assert 0 < len(new) < 50
     assert f"| quickstart | {len(seen)} | {len(new)} |" in capsys.readouterr().out
