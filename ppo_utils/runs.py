@@ -369,7 +369,8 @@ def close(run: Run) -> None:
     """Close all files, environments and connections, the others too if one raises."""
     with contextlib.ExitStack() as stack:  # from the last to the first
         stack.callback(leave_processes)
-        stack.callback(torch.set_num_threads, run.threads)
+        if torch.get_num_threads() != run.threads:
+            stack.callback(torch.set_num_threads, run.threads)
         stack.enter_context(contextlib.suppress(OSError))  # that a file cannot be written was reported before
         for each in filter(None, (run.lock, run.writer, run.envs, run.eval_envs, run.bar)):
             stack.callback(each.close)

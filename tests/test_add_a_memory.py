@@ -47,7 +47,7 @@ def test_the_memory_of_the_page(tmp_path):
         return done.stdout
 
     def train_and_evaluate():
-        few = ["--seeds", "1", "--steps", "3e3", "--evaluations", "1", "--test-levels", "5"]
+        few = ["--seeds", "1", "--steps", "3e3", "--evaluations", "1"]
         tasks = ("--tasks", "mortar-mayhem", "--agents", "ppo_mingru.py --num-envs 16")
         command(tmp_path / "benchmarks/learning.py", *tasks, *few)()
         (model,) = tmp_path.glob("learning/runs/*/model.pt")

@@ -43,8 +43,9 @@ for name, args, weights, rollout in torch.load("given.pt", weights_only=False):
     share = {name: part[:, lanes] for name, part in rollout.items() if isinstance(part, torch.Tensor)}
     share["obs"] = {name: part[:, lanes] for name, part in rollout["obs"].items()}
     stored = ("stored",) if script.__name__ == "ppo_gru" else ("hidden", "row_step")
-    memory = replace(rollout["memory"], **{name: getattr(rollout["memory"], name)[:, lanes] for name in stored})
-    rollout = script.Rollout(**rollout | share | {"memory": memory})
+    state = rollout["memory_state"]
+    state = replace(state, **{name: getattr(state, name)[:, lanes] for name in stored})
+    rollout = script.Rollout(**rollout | share | {"memory_state": state})
     optimizer = torch.optim.SGD(run.agent.parameters(), lr=1.0)
     step_logs, _ = script.update(run.agent, [optimizer], rollout, 0.01, args)
     logs = mean_logs(step_logs, rollout.values, rollout.returns)

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import SCRIPTS, parse_args
-from programs import run_command
+from programs import Program, run_command
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import ppo_gru
@@ -153,20 +153,21 @@ def test_numbers_that_slow_a_cpu_down_are_zero(tiny):
         ({"env_id": "Image-v0", "obs_type": "vector"}, None, 2),
     ],
 )
-def test_threads_of_a_training(tiny, opened, monkeypatch, changes, variable, threads):
+def test_threads_of_a_training(tiny, monkeypatch, changes, variable, threads):
     """One without images, unless told otherwise; afterwards as many as before."""
     monkeypatch.delenv("OMP_NUM_THREADS")
     if variable:
         monkeypatch.setenv("OMP_NUM_THREADS", variable)
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        run = opened(ppo_gru, tiny(**changes))
-        assert torch.get_num_threads() == threads
+
+    def count():
+        torch.set_num_threads(2)
+        run = ppo_gru.setup(tiny(**changes))
+        print(torch.get_num_threads())
         runs.close(run)
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
+        print(torch.get_num_threads())
+
+    with Program(count) as program:  # what was forked after two threads have computed would wait for them
+        assert program.wait().stdout == f"{threads}\n2\n"
 
 
 def test_trains_on_vectors_and_their_frequencies(tiny, scalars):
