@@ -18,7 +18,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,10 +28,10 @@ import torch
 import tyro
 from torch import Tensor, nn
 
-from ppo_utils.checkpoints import import_script, load_weights, read_model, saved_args
-from ppo_utils.environments import as_tensors, envs_for, is_memory_gym, with_options, wrappers_of
+from ppo_utils.checkpoints import Checkpoint
+from ppo_utils.environments import as_tensors, envs_for, is_memory_gym, wrappers_of
 from ppo_utils.errors import RunError
-from ppo_utils.evaluation import MEMORY_STEPS, first_after, make_agent, with_room
+from ppo_utils.evaluation import MEMORY_STEPS, first_after, with_room
 from ppo_utils.flags import bounded, check_bounds
 from ppo_utils.infos import final_numbers, ground_truths
 from ppo_utils.terminal import one_line_exit, open_streams
@@ -382,16 +382,11 @@ def load(path: str, env_options: str | None = None) -> tuple[nn.Module, gym.vect
     env_options: JSON, over those of the training. Raises ValueError, OSError, ImportError, gymnasium.error.Error or
     RunError, each with one line for the user.
     """
-    saved = read_model(path)
-    script = import_script(saved, path)
-    args = replace(saved_args(script.Args, saved), amp=False)  # one lane is little work; not all CPUs have bfloat16
-    check_draws("enjoy.py", args.env_id)
-    args = with_options(args, env_options)
-    envs = envs_for(args, 1, render_mode="debug_rgb_array", asynchronous=False)
-    _, infos = envs.reset()
-    agent = make_agent(script.Agent, envs, infos, args)
-    load_weights(agent, saved, path)
-    return agent, envs, args
+    checkpoint = Checkpoint.read(path, env_options)
+    checkpoint.args.amp = False  # one lane is little work; not all CPUs have bfloat16
+    check_draws("enjoy.py", checkpoint.args.env_id)
+    envs = envs_for(checkpoint.args, 1, render_mode="debug_rgb_array", asynchronous=False)
+    return checkpoint.agent(envs, envs.reset()[1]), envs, checkpoint.args
 
 
 def main(config: Config) -> str:

@@ -21,22 +21,21 @@ import json
 import os
 import sys
 from collections import defaultdict
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 import torch
 import tyro
-from torch import nn
 from tqdm import tqdm
 
-from ppo_utils.checkpoints import import_script, load_weights, read_model, saved_args
-from ppo_utils.environments import envs_for, is_memory_gym, with_options
+from ppo_utils.checkpoints import Checkpoint
+from ppo_utils.environments import envs_for, is_memory_gym
 from ppo_utils.errors import RunError
-from ppo_utils.evaluation import are_trained_on, evaluate, evaluation_levels, first_after, make_agent
+from ppo_utils.evaluation import are_trained_on, evaluate, evaluation_levels, first_after
 from ppo_utils.flags import NonNegativeInt, PositiveInt, check_bounds
 from ppo_utils.runs import report_out_of_memory
 from ppo_utils.scores import own_metric, summary, table, task_of, tasks_of
@@ -86,46 +85,6 @@ class Config:
     length and falls)"""
 
 
-@dataclass
-class Checkpoint:
-    """What a model file holds, read once."""
-
-    path: str
-    script: ModuleType  # that trained it
-    saved: dict[str, Any]  # script, args and weights
-    step: int | None  # of the training, at which it was written; None if the file does not tell
-    args: Any  # the script's Args
-
-    @classmethod
-    def read(cls, path: str, env_options: str | None = None) -> "Checkpoint":
-        """Read a file, to play with further reset options, JSON.
-
-        Raises ValueError if it is no checkpoint, its script is not here or its environment does not have the options,
-        OSError without a file.
-        """
-        saved = read_model(path)
-        script = import_script(saved, path)
-        # A file to resume from holds much more, which would stay in memory.
-        needed = {name: saved[name] for name in ("script", "args", "weights")}
-        args = with_options(saved_args(script.Args, saved), env_options)
-        return cls(path, script, needed, saved.get("step"), args)
-
-    def arguments(self) -> dict[str, Any]:
-        """Return the arguments by name, with the script's name, and the step if it is known."""
-        step = {} if self.step is None else {"step": self.step}
-        return {"script": self.script.__name__, **asdict(self.args), **step}
-
-    def agent(self, envs: gym.vector.VectorEnv) -> nn.Module:
-        """Return the agent, on the CPU, for environments that are reset; raise ValueError for weights that do not fit.
-
-        Raises what `make_agent` raises.
-        """
-        _, infos = envs.reset()
-        agent = make_agent(self.script.Agent, envs, infos, self.args)
-        load_weights(agent, self.saved, self.path)
-        return agent
-
-
 def play(checkpoint: Checkpoint, config: Config) -> dict[str, np.ndarray]:
     """Let a checkpoint's agent play the levels; return numbers (M, E) by name.
 
@@ -140,7 +99,7 @@ def play(checkpoint: Checkpoint, config: Config) -> dict[str, np.ndarray]:
         with report_out_of_memory(config, device):
             envs = envs_for(args, len(batch), asynchronous=False)  # a process for each episode would be many
             if agent is None:
-                agent = checkpoint.agent(envs).to(device)
+                agent = checkpoint.agent(envs, envs.reset()[1]).to(device)
                 torch.manual_seed(config.seed)
             played = evaluate(agent, envs, batch, config.max_steps, amp=args.amp, deterministic=config.deterministic)
         envs.close()

@@ -28,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other pac
 import evaluate
 from enjoy import attention_weights
 from learning import FIRST_TEST_LEVEL
+from ppo_utils.checkpoints import Checkpoint
 from ppo_utils.environments import envs_for
 from ppo_utils.errors import RunError
 from ppo_utils.flags import PositiveInt, check_bounds
@@ -141,13 +142,13 @@ def main(config: Config) -> None:
     levels = [*range(FIRST_TEST_LEVEL, FIRST_TEST_LEVEL + config.levels)]
     rows = []
     for path in config.checkpoints:
-        checkpoint = evaluate.Checkpoint.read(path)
+        checkpoint = Checkpoint.read(path)
         args = checkpoint.args
         if args.env_id not in SUBJECTS or not hasattr(args, "trxl_memory_length"):
             raise ValueError(f"{path} was trained by {checkpoint.script.__name__}.py in {args.env_id}; {suitable}")
         name, look = SUBJECTS[args.env_id]
         envs = Shown(envs_for(args, config.levels), look)
-        agent = checkpoint.agent(envs)
+        agent = checkpoint.agent(envs, envs.reset()[1])
         torch.manual_seed(0)
         share, blocks = attended(agent, envs, levels)
         heads = "; ".join(", ".join(f"{100 * head:.0f}" for head in block) for block in blocks)

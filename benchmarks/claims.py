@@ -39,6 +39,7 @@ import learning
 import suites
 import tables
 from ppo_utils.run_logs import RunLog, align
+from ppo_utils.terminal import one_line_exit
 from suites import Task
 from tables import LEVEL, Comparison
 
@@ -558,9 +559,5 @@ def main(config: Config) -> None:
 
 if __name__ == "__main__":
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
-    try:
+    with one_line_exit(OSError):
         main(tyro.cli(Config))
-    except OSError as error:
-        sys.exit(f"claims.py: {error}")
-    except KeyboardInterrupt:
-        sys.exit(130)

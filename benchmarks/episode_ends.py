@@ -25,6 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other pac
 
 import evaluate
 from learning import FIRST_TEST_LEVEL
+from ppo_utils.checkpoints import Checkpoint
 from ppo_utils.environments import envs_for
 from ppo_utils.errors import RunError
 from ppo_utils.flags import PositiveInt, check_bounds
@@ -98,12 +99,12 @@ def main(config: Config) -> None:
         raise ValueError(f"give agents of {' or '.join(ENDS)}")
     levels = [*range(FIRST_TEST_LEVEL, FIRST_TEST_LEVEL + config.levels)]
     for path in config.checkpoints:
-        checkpoint = evaluate.Checkpoint.read(path)
+        checkpoint = Checkpoint.read(path)
         args = checkpoint.args
         if args.env_id not in ENDS:
             raise ValueError(f"{path} was trained in {args.env_id}; give agents of {' or '.join(ENDS)}")
         envs = envs_for(args, config.levels)
-        agent = checkpoint.agent(envs)
+        agent = checkpoint.agent(envs, envs.reset()[1])
         torch.manual_seed(0)
         play = partial(evaluate.evaluate, agent, levels=levels, max_steps=sys.maxsize)
         print(f"{path}: {ENDS[args.env_id](envs, play)}")

@@ -51,6 +51,7 @@ from ppo_utils.flags import PositiveInt, check_args, check_bounds, check_minibat
 from ppo_utils.run_logs import SECONDS, NoCurvesError, RunLog, Runs, align, read_run
 from ppo_utils.runs import parse_args
 from ppo_utils.scores import own_metric
+from ppo_utils.terminal import one_line_exit
 from suites import AGENTS, SUITES, TASKS, Task, short
 
 ROOT = Path(__file__).parent.parent
@@ -523,9 +524,5 @@ def main(config: Config) -> None:
 
 if __name__ == "__main__":
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
-    try:
+    with one_line_exit(OSError, NoCurvesError):
         main(tyro.cli(Config))
-    except (OSError, NoCurvesError) as error:
-        sys.exit(f"learning.py: {error}")
-    except KeyboardInterrupt:
-        sys.exit(130)

@@ -33,6 +33,7 @@ from ppo_utils.checkpoints import checkpoints_in, save_checkpoint
 from ppo_utils.flags import NonNegativeFloat, NonNegativeInt, PositiveInt, check_bounds
 from ppo_utils.run_logs import read_run
 from ppo_utils.runs import close, parse_args
+from ppo_utils.terminal import one_line_exit
 
 FLAGS = "--preset laptop --env-id MysteryPath-Grid-v0 --num-envs 4 --num-steps 32 --num-minibatches 2 --no-cuda"
 
@@ -184,9 +185,5 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with one_line_exit(ValueError, RuntimeError, OSError):
         main(tyro.cli(Config))
-    except (ValueError, RuntimeError, OSError) as error:
-        sys.exit(f"survival.py: {' '.join(str(error).split())}")
-    except KeyboardInterrupt:
-        sys.exit(130)

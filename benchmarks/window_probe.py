@@ -17,12 +17,13 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from ppo_utils.errors import RunError
-
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
 
 import evaluate
+from ppo_utils.checkpoints import Checkpoint
+from ppo_utils.errors import RunError
 from ppo_utils.scores import iqm, own_metric
+from ppo_utils.terminal import one_line_exit
 
 
 @dataclass
@@ -41,7 +42,7 @@ class Config:
     """steps after which an endless episode is cut short"""
 
 
-def row(checkpoint: evaluate.Checkpoint, window: int, metric: str, settings: evaluate.Config) -> str:
+def row(checkpoint: Checkpoint, window: int, metric: str, settings: evaluate.Config) -> str:
     """Return the row of a window; raise ValueError where an episode was cut short, which has no final score."""
     args = replace(checkpoint.args, trxl_memory_length=window)
     played = evaluate.play(replace(checkpoint, args=args), settings)
@@ -61,7 +62,7 @@ def main(config: Config) -> None:
         raise ValueError(f"--windows is {given}; give windows of 1 step or more")
     settings = evaluate.Config(levels=config.levels, repeats=config.repeats, max_steps=config.max_steps)
     evaluate.check_numbers(settings)
-    checkpoint = evaluate.Checkpoint.read(config.checkpoint)
+    checkpoint = Checkpoint.read(config.checkpoint)
     if not hasattr(checkpoint.args, "trxl_memory_length"):
         script = checkpoint.script.__name__
         raise ValueError(f"{config.checkpoint} was trained by {script}.py; only transformers have a window")
@@ -72,9 +73,5 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with one_line_exit(ValueError, OSError, ImportError, gym.error.Error, RunError):
         main(tyro.cli(Config))
-    except (ValueError, OSError, ImportError, gym.error.Error, RunError) as error:
-        sys.exit(f"window_probe.py: {' '.join(str(error).split())}")
-    except KeyboardInterrupt:
-        sys.exit(130)

@@ -8,10 +8,10 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array
 
-from ppo_utils.checkpoints import import_script, load_weights, read_model, saved_args
+from ppo_utils.checkpoints import Checkpoint
 from ppo_utils.environments import as_tensors, env_actions, envs_for, wrap_envs, wrappers_of
 from ppo_utils.errors import report_unusable_policy
-from ppo_utils.evaluation import MEMORY_STEPS, make_agent, with_room
+from ppo_utils.evaluation import MEMORY_STEPS, with_room
 from ppo_utils.lanes import check_fits
 
 
@@ -25,17 +25,15 @@ class Player:
     """
 
     def __init__(self, path: str | Path, deterministic: bool = False):
-        saved = read_model(path)
-        script = import_script(saved, path)
-        self.args, self.deterministic = saved_args(script.Args, saved), deterministic
+        checkpoint = Checkpoint.read(path)
+        self.args, self.deterministic = checkpoint.args, deterministic
         self.args.ground_truth_coef = self.args.reconstruction_coef = 0.0  # the auxiliary heads do not act
         self.args.amp = self.args.async_envs = False  # there is little to compute
         envs = envs_for(self.args, 1)
         envs.close()
         self.given = GivenObservations(envs.unwrapped)
         self.envs = wrap_envs(self.given, **wrappers_of(self.args))
-        self.agent = make_agent(script.Agent, self.envs, {}, self.args)
-        load_weights(self.agent, saved, path)
+        self.agent = checkpoint.agent(self.envs, {})
         self.reset()
 
     def reset(self) -> None:

@@ -14,17 +14,18 @@ import random
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
-from ppo_utils.environments import load_state, save_state
-from ppo_utils.evaluation import are_trained_on, first_after
+from ppo_utils.environments import load_state, save_state, with_options
+from ppo_utils.evaluation import are_trained_on, first_after, make_agent
 from ppo_utils.flags import RunArgs, as_flags, flag
 from ppo_utils.processes import all_gather, rank_and_size
 from ppo_utils.run import Run
@@ -204,6 +205,45 @@ def load_weights(agent: nn.Module, saved: dict[str, Any], path: str | Path) -> N
         raise ValueError(f"{path} holds the weights of another network, trained with {as_flags(theirs)}") from None
     if not all(weight.isfinite().all() for weight in saved["weights"].values()):
         raise ValueError(f"{path} holds weights that are not finite: the training diverged")
+
+
+@dataclass
+class Checkpoint:
+    """What a model or a checkpoint holds of a trained agent, read once."""
+
+    path: str | Path
+    script: ModuleType  # that trained it
+    saved: dict[str, Any]  # script, args and weights
+    step: int | None  # of the training, at which it was written; None if the file does not tell
+    args: Any  # the script's Args
+
+    @classmethod
+    def read(cls, path: str | Path, env_options: str | None = None) -> Checkpoint:
+        """Read a file, to play with further reset options, JSON.
+
+        Raises ValueError if it is no checkpoint, its script is not here or its environment does not have the options,
+        OSError without a file.
+        """
+        saved = read_model(path)
+        script = import_script(saved, path)
+        # A file to resume from holds much more, which would stay in memory.
+        needed = {name: saved[name] for name in ("script", "args", "weights")}
+        args = with_options(saved_args(script.Args, saved), env_options)
+        return cls(path, script, needed, saved.get("step"), args)
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments by name, with the script's name, and the step if it is known."""
+        step = {} if self.step is None else {"step": self.step}
+        return {"script": self.script.__name__, **asdict(self.args), **step}
+
+    def agent(self, envs: VectorEnv, infos: dict[str, Any]) -> nn.Module:
+        """Return the agent, on the CPU, for environments; infos are those of a reset.
+
+        Raises ValueError for weights that do not fit, and what `make_agent` raises.
+        """
+        agent = make_agent(self.script.Agent, envs, infos, self.args)
+        load_weights(agent, self.saved, self.path)
+        return agent
 
 
 # ---- going on ----

@@ -10,6 +10,7 @@ import tyro
 
 import evaluate
 import learning
+from ppo_utils.checkpoints import Checkpoint
 
 AGENTS = Path(__file__).parents[1] / "agents"
 ROWS = re.findall(r"^\| `(\S+)` \| (\w+) \| ([\d.]+) \| `python benchmarks/learning.py (.+)` \|$",
@@ -25,7 +26,7 @@ def test_the_table_has_all_agents():
 
 @pytest.mark.parametrize(("name", "metric", "score", "flags"), ROWS, ids=[row[0] for row in ROWS])
 def test_an_agent_plays_as_well_as_published(name, metric, score, flags):
-    checkpoint = evaluate.Checkpoint.read(str(AGENTS / name))
+    checkpoint = Checkpoint.read(str(AGENTS / name))
     few = 20 if "endless" in name else 75  # of the 1,000 test levels; endless episodes are long
     levels = evaluate.Config(start_level=learning.FIRST_TEST_LEVEL, levels=few, repeats=1)
     scores = evaluate.play(checkpoint, levels)[metric]  # (M, E)

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 import attention
-import evaluate
 from memory_gym_envs.entries import vector_slices
 from memory_gym_envs.players import player
+from ppo_utils.checkpoints import Checkpoint
 from ppo_utils.environments import envs_for
 
 ROOT = Path(__file__).parents[1]
@@ -61,7 +61,7 @@ def test_what_steps_showed_is_what_an_observer_of_the_vectors_saw(env_id):
 @pytest.mark.parametrize("env_id", ["MortarMayhem-Grid-v0", "MysteryPath-Grid-v0"])
 def test_shares_of_attention(env_id, monkeypatch):
     """Uniform attention gives what is looked for its share of the steps; a head that looks at nothing else, all."""
-    checkpoint = evaluate.Checkpoint.read(agent_of(env_id))
+    checkpoint = Checkpoint.read(agent_of(env_id))
     envs = attention.Shown(envs_for(checkpoint.args, 20), attention.SUBJECTS[env_id][1])
     levels = [*range(20)]
 
@@ -72,7 +72,7 @@ def test_shares_of_attention(env_id, monkeypatch):
 
     monkeypatch.setattr(attention, "attention_weights", weights)
     torch.manual_seed(0)
-    share, (heads,) = attention.attended(checkpoint.agent(envs), envs, levels)
+    share, (heads,) = attention.attended(checkpoint.agent(envs, {}), envs, levels)
     assert heads[:2] == pytest.approx([share, 1.0], abs=1e-6)
     assert 0.02 < share < 0.2
     if "Mortar" in env_id:
@@ -83,9 +83,9 @@ def test_shares_of_attention(env_id, monkeypatch):
 
 def test_weights_are_those_of_the_agent():
     """With queries of zero, its own attention is uniform."""
-    checkpoint = evaluate.Checkpoint.read(agent_of("MysteryPath-Grid-v0"))
+    checkpoint = Checkpoint.read(agent_of("MysteryPath-Grid-v0"))
     envs = attention.Shown(envs_for(checkpoint.args, 20), attention.falls)
-    agent = checkpoint.agent(envs)
+    agent = checkpoint.agent(envs, {})
     agent.memory.blocks[0].attention.query.weight.data.zero_()
     share, (heads,) = attention.attended(agent, envs, [*range(20)])
     assert heads == pytest.approx([share] * 4, abs=1e-6)
@@ -118,7 +118,7 @@ def test_who_cannot_be_asked(config, message):
 
 
 def test_levels_without_a_fall():
-    checkpoint = evaluate.Checkpoint.read(agent_of("MysteryPath-Grid-v0"))
+    checkpoint = Checkpoint.read(agent_of("MysteryPath-Grid-v0"))
     envs = attention.Shown(envs_for(checkpoint.args, 1), lambda s: (np.full(1, -1), np.zeros(1)))
     with pytest.raises(ValueError, match="no step could attend"):
-        attention.attended(checkpoint.agent(envs), envs, [0])
+        attention.attended(checkpoint.agent(envs, {}), envs, [0])

@@ -23,8 +23,8 @@ import memory_gym_envs
 import ppo_gru
 import ppo_trxl
 from learning import write_run
-from ppo_utils import evaluation
-from ppo_utils.checkpoints import load_weights, read_model, saved_args
+from ppo_utils import checkpoints, evaluation
+from ppo_utils.checkpoints import Checkpoint, load_weights, read_model, saved_args
 from ppo_utils.curves import curve_name, draw_curves, draw_metric, draw_tasks, wall_time
 from ppo_utils.environments import envs_for
 from ppo_utils.evaluation import make_agent
@@ -469,7 +469,7 @@ def test_the_arguments_of_a_run_of_another_script():
 def test_a_model_of_another_script():
     for name in ("ppo_other", "ppo_utils"):
         torch.save({"script": name, "args": {}, "weights": {}}, "model.pt")
-        for read in (evaluate.Checkpoint.read, enjoy.load):
+        for read in (Checkpoint.read, enjoy.load):
             with pytest.raises(ValueError, match=rf"model\.pt was trained by {name}\.py, which is not here; run"):
                 read("model.pt")
 
@@ -478,7 +478,7 @@ def test_a_file_names_no_other_module():
     """A file from elsewhere must not have any module imported."""
     torch.save({"script": "antigravity", "args": {}, "weights": {}}, "model.pt")
     with pytest.raises(ValueError, match="was trained by antigravity"):
-        evaluate.Checkpoint.read("model.pt")
+        Checkpoint.read("model.pt")
     assert "antigravity" not in sys.modules
 
 
@@ -699,7 +699,7 @@ def test_what_one_batch_alone_reports_is_unknown_in_the_others(agents, monkeypat
     found = iter([{"return": np.ones(4), "coins": np.ones(4)}, {"return": np.ones(4)}])
     monkeypatch.setattr(evaluate, "evaluate", lambda *_, **__: next(found))
     monkeypatch.setattr(evaluate, "AT_ONCE", 4)
-    checkpoint = evaluate.Checkpoint.read(f"{agents[0]}/model.pt")
+    checkpoint = Checkpoint.read(f"{agents[0]}/model.pt")
     played = evaluate.play(checkpoint, evaluate.Config(levels=4, repeats=2, cuda=False))
     assert np.isnan(played["coins"]).tolist() == [[False] * 2] * 2 + [[True] * 2] * 2
     assert (played["return"] == 1).all()
@@ -771,9 +771,9 @@ def test_several_files_of_a_run(agents, monkeypatch, capsys):
         run, step = files[path]
         return read_model(f"{agents[run]}/model.pt") | {"step": step, "optimizers": []}
 
-    monkeypatch.setattr(evaluate, "read_model", read)
+    monkeypatch.setattr(checkpoints, "read_model", read)
     config = evaluate.Config(tuple(files), max_steps=3, json="scores.json", **FEW)
-    assert evaluate.Checkpoint.read("2/model.pt").saved.keys() == {"script", "args", "weights"}
+    assert Checkpoint.read("2/model.pt").saved.keys() == {"script", "args", "weights"}
     evaluate.main(config)
     (task,) = json.loads(Path("scores.json").read_text())
     assert {agent["agent"]: agent["runs"] for agent in task["agents"]} == {

@@ -25,7 +25,7 @@ import evaluate
 import learning
 import ppo_gru
 import tables
-from ppo_utils.checkpoints import read_checkpoint
+from ppo_utils.checkpoints import Checkpoint, read_checkpoint
 from ppo_utils.run_logs import SECONDS, RunLog
 from ppo_utils.runs import run_to_end
 from ppo_utils.scores import iqm
@@ -185,7 +185,7 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
     steps, tested = kept.curves["test/carried_out"]
     assert (steps.tolist(), tested.shape) == ([whole.last_step], (1, 5, 1))
     played = evaluate.Config(start_level=1_000_000, levels=5, repeats=1, seed=1)
-    returns = evaluate.play(evaluate.Checkpoint.read(f"{whole.path}/model.pt"), played)["return"]
+    returns = evaluate.play(Checkpoint.read(f"{whole.path}/model.pt"), played)["return"]
     assert tested[0] == pytest.approx(returns / 0.4), "of four commands, 0.1 each"
     carried_out = kept.curves["eval/carried_out"][1]
     assert carried_out == pytest.approx(kept.curves["eval/return"][1] / 0.4), "of four commands, 0.1 each"

@@ -7,6 +7,7 @@ import evaluate
 import ppo_gru
 import ppo_trxl
 import window_probe
+from ppo_utils.checkpoints import Checkpoint
 
 TASK = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector", "save_model": True}
 
@@ -37,7 +38,7 @@ def test_rows_of_the_windows(trained, monkeypatch, capsys):
     assert float(wide[-1]) < 100
     assert wide[1:] == wider[1:], "no episode is longer"
 
-    played = play(evaluate.Checkpoint.read("model.pt"), evaluate.Config(levels=3, repeats=2))
+    played = play(Checkpoint.read("model.pt"), evaluate.Config(levels=3, repeats=2))
     assert float(trained[1]) == pytest.approx(played["carried_out"].mean(), abs=0.005)
     assert float(trained[4]) == np.max(played["length"])
 
