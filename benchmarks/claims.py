@@ -503,7 +503,7 @@ def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, V
     runs: of each claim that was asked for, by its agents.
     """
     stars = dict(zip(verdicts, holm([each.p_value for each in verdicts.values()]), strict=True))
-    tested, not_run, shares, lacks = [HEADING], [NOT_RUN], Counter(), 0
+    tested, not_run, shares, mixed, lacks = [HEADING], [NOT_RUN], Counter(), 0, 0
     for statement in STATEMENTS:
         said = statement.text, statement.thesis  # once, above rows that say the same of other tasks
         names = [name for name in statement.claims if name in verdicts]
@@ -511,7 +511,9 @@ def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, V
             tested.append(row(name, runs[name], str(verdicts[name]) + " \\*" * stars[name], said))
             said = "", ""
         if names:
-            shares[share_that_holds([verdicts[name].text for name in names])] += 1
+            found = [verdicts[name].text for name in names]
+            shares[share_that_holds(found)] += 1
+            mixed += {"holds", "does not hold"} <= {*found}
         lacking = [f"`{name}`" for name in statement.claims if name in runs and name not in verdicts]
         # What no claim was made of has a row all the same, unless only some claims were asked for.
         if lacking or (not statement.claims and runs.keys() == CLAIMS.keys()):
@@ -519,12 +521,13 @@ def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, V
             lacks += len(lacking) or 1
     counts = Counter(found.text for found in verdicts.values())
     print(
-        f"Of {shares.total()} statements tested, {shares['all']} hold in all their rows and {shares['some']} in some; "
+        f"Of {shares.total()} statements tested, {shares['all']} hold in all their rows and {shares['some']} in some "
+        f"({mixed} of which do not hold in others); "
         f"of the others, {shares['none']} do not hold, {shares['open']} are not decided or not learned."
     )
     print(
         f"Of {counts.total()} rows tested, {counts['holds']} hold and {counts['does not hold']} do not "
-        f"({sum(stars.values())} with a star), "
+        f"({sum(stars.values())} of these with a star), "
         f"{counts['not decided']} are not decided, {counts['not learned']} not learned. {lacks} more were not run."
     )
     for table in (tested, not_run):

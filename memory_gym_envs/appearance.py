@@ -26,8 +26,8 @@ CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # (4, 2) of a square, in u
 def agent_entries(low: int, high: int) -> tuple[Entries, ...]:
     """The first entries of a vector, for agents whose centre stays between these pixels on both axes."""
     size = f"radius of the agent's body, / {LARGEST_RADIUS} pixels; 0: none of it is visible"
-    centre = "the agent's centre, x and y, / 84 pixels; the middle of all places that would look the same"
-    facing = "the agent's facing, one-hot; 1 for each that would look the same"
+    centre = "the agent's centre, x and y, / 84 pixels"
+    facing = "the agent's facing, one-hot"
     ends = min(low / SCREEN, 0.0), high / SCREEN
     return Entries("size", 1, size), Entries("place", 2, centre, *ends), Entries("facing", FACINGS, facing)
 

@@ -275,7 +275,7 @@ def test_what_is_learned_is_judged_by_all_runs_without_memory(monkeypatch, capsy
 
     monkeypatch.setattr(learning, "result_of", result_of)
     claims.main(claims.Config(claims=(claim,), report=True))
-    assert f" hold and 0 do not (0 with a star), {counts}" in capsys.readouterr().out
+    assert f" hold and 0 do not (0 of these with a star), {counts}" in capsys.readouterr().out
 
 
 def test_a_statement_stands_once_above_its_claims():
@@ -318,9 +318,10 @@ def test_in_how_many_rows_statements_hold(monkeypatch, capsys):
     monkeypatch.setattr(claims, "judge", lambda claim, *_: found[id(claim)])
     claims.main(claims.Config(claims=tuple(verdicts), report=True))
     assert capsys.readouterr().out.splitlines()[:2] == [
-        "Of 4 statements tested, 1 hold in all their rows and 1 in some; of the others, 1 do not hold, 1 are not "
-        "decided or not learned.",
-        "Of 8 rows tested, 3 hold and 2 do not (2 with a star), 2 are not decided, 1 not learned. 0 more were not run.",
+        "Of 4 statements tested, 1 hold in all their rows and 1 in some (1 of which do not hold in others); of the "
+        "others, 1 do not hold, 1 are not decided or not learned.",
+        "Of 8 rows tested, 3 hold and 2 do not (2 of these with a star), 2 are not decided, 1 not learned. 0 more were "
+        "not run.",
     ]
 
 
@@ -330,7 +331,7 @@ def test_statements_without_runs_have_a_row(monkeypatch, capsys):
     statements, rows_tested, _, head, _, *rows = capsys.readouterr().out.splitlines()
     assert head == "| not run | thesis | `--claims` |"
     assert len(rows) == len(claims.STATEMENTS)
-    assert statements.startswith("Of 0 statements tested, 0 hold in all their rows and 0 in some; ")
+    assert statements.startswith("Of 0 statements tested, 0 hold in all their rows and 0 in some (0 of which ")
     assert rows[0].endswith("|  | `memory-MortarMayhem-Grid-v0`, `memory-MortarMayhem-v0` |")
     assert rows[-1].startswith("| 7.2 In BossFight,")
     count = len(claims.CLAIMS) + sum(not statement.claims for statement in claims.STATEMENTS)

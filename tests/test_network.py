@@ -189,7 +189,7 @@ def test_the_spread_of_a_fresh_learned_encoding():
 
 
 def test_the_gate_by_its_equations():
-    """Those of Parisotto et al. (2020), section 3.2, as docs/memory.md has them."""
+    """Those of Parisotto et al. (2020), section 3.2, as docs/thesis.md has them."""
     torch.manual_seed(0)
     gate = ppo_trxl.Gate(6, 2.0).double()
     x, y = torch.randn(2, 4, 3, 6, dtype=torch.float64)
