@@ -62,15 +62,14 @@ def main(out: Path = BOUNDS, levels: int = TEST_LEVELS, max_steps: int = MAX_STE
         levels: how many test levels to play.
         max_steps: steps after which an endless episode is cut short.
     """
-    with out.open("w", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(("task", "random", "scripted"))
-        for name, task in (FINITE_SMALL | FULL).items():
-            new = scored_levels(task.env_id, task.options)
-            which = slice(None) if new is None else new[:levels]
-            scores = [play(task, each, levels, max_steps)[which].mean() for each in (random_player, scripted_player)]
-            table.writerow((name, *(f"{each:.4g}" for each in scores)))
-            file.flush()
+    rows = [("task", "random", "scripted")]
+    for name, task in (FINITE_SMALL | FULL).items():
+        new = scored_levels(task.env_id, task.options)
+        which = slice(None) if new is None else new[:levels]
+        scores = [play(task, each, levels, max_steps)[which].mean() for each in (random_player, scripted_player)]
+        rows.append((name, *(f"{each:.4g}" for each in scores)))
+    with out.open("w", newline="") as file:  # not before all has been played: what was stopped changes nothing
+        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 if __name__ == "__main__":

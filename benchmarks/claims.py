@@ -11,8 +11,8 @@ seeds and levels. The claim holds if all of its pairs are decided its way; it do
 way, with its p-value multiplied by the number of pairs; else it is not decided, and of a single pair the table has the
 95 % interval of the difference. Where the thesis says that agents are no better than others, it does not hold if one of
 them is ahead, with p as before, and is not decided else. Where no agent of a row scores higher than those without
-memory, or all have less than a quarter of what is possible (in endless tasks, of what the thesis' transformer has; nine
-tenths where falls are counted), the task has not been learned, and there is no verdict.
+memory, or all have less than a quarter of what is possible (in endless tasks, of what the thesis' transformer has), or
+where falls are counted and one has less than nine tenths, the task has not been learned, and there is no verdict.
 
 With so many rows, some verdicts come by chance. A star marks those that also stand at a family-wise error of 5 % (Holm,
 1979). A row of several pairs has the largest of their p-values where all of them are needed, else the smallest times

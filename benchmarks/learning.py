@@ -198,7 +198,7 @@ def runs_in(place: str, plan: Plan) -> list[RunLog]:
     """Return the runs that were planned so among the folders, or the files of results, in a place."""
     wanted = settings(plan.logged_args())
     found = []
-    for path in sorted(glob.glob(f"{place}/{plan.task.env_id}__*__{plan.seed}__*")):
+    for path in sorted(glob.glob(f"{glob.escape(place)}/{plan.task.env_id}__*__{plan.seed}__*")):
         with contextlib.suppress(NoCurvesError):
             is_file = os.path.isfile(path)  # a folder changes while it is trained
             found.append(read_file(path, os.stat(path).st_mtime_ns) if is_file else read_run(path))
@@ -282,7 +282,7 @@ def train(config: Training, plan: Plan) -> None:
     """Run a training, or go on with one that was stopped; raise SystemExit that names its log if it fails."""
     line = plan.command
     for run in runs_in(f"{config.folder}/runs", plan):
-        if glob.glob(f"{run.path}/checkpoint-*.pt"):
+        if glob.glob(f"{glob.escape(run.path)}/checkpoint-*.pt"):
             line = [*line[:2], "--resume", os.path.relpath(run.path, config.folder)]
     log = log_of(config, plan)
     with log.open("a") as output:

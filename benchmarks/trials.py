@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of 
 
 import learning
 from ppo_utils.run_logs import NoCurvesError, RunLog, read_run
+from ppo_utils.terminal import one_line_exit
 from suites import TASKS
 
 TRIALS = Path(__file__).with_name("trials.csv")
@@ -74,9 +75,9 @@ def read_trials(task: str) -> dict[str, list[Curve]]:
 
 
 def score_at(curve: Curve, millions: float) -> float:
-    """Return the score of the last evaluation until then; NaN if there is none, or if the run had ended."""
-    scores = [score for step, score in curve.items() if step <= 1e6 * millions]
-    return scores[-1] if scores and max(curve) > 0.95e6 * millions else np.nan
+    """Return the score then, linear between evaluations; NaN before the first, and if the run ended 5 % earlier."""
+    step, steps = 1e6 * millions, [*curve]
+    return float(np.interp(step, steps, [*curve.values()])) if steps[0] <= step < steps[-1] / 0.95 else np.nan
 
 
 def row(agent: str, curves: list[Curve], columns: tuple[float, ...]) -> str:
@@ -102,7 +103,5 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with one_line_exit(NoCurvesError, OSError):
         main(tyro.cli(Config))
-    except (NoCurvesError, OSError) as error:
-        sys.exit(f"trials.py: {error}")

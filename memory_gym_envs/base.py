@@ -243,8 +243,9 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         """
         if not self.ready:
             raise gym.error.ResetNeeded("call reset() before oracle()")
-        seeds = [-1 if seed is None else seed for seed in self._seeds]
-        return {"seed": np.array(seeds), "length": self.state.length.copy()}
+        # Without a seed given, Gymnasium draws one of 128 bits, which is no level.
+        seeds = [-1 if seed is None or seed > NO_LIMIT else seed for seed in self._seeds]
+        return {"seed": np.array(seeds, np.int64), "length": self.state.length.copy()}
 
     def longest_episode(self, lane: int) -> int:
         """The steps after which the lane's episode is over at the latest, under its reset options; -1: no limit."""

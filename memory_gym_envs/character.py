@@ -157,7 +157,7 @@ def walk(
     """One step of all figures: the new facings (N,) and positions (N, 2).
 
     action: (N,) controls.actions - 1 for agents that may not move.
-    start: (N, 1) where the lane's walk table starts.
+    start: where the lane's walk table starts, (N, 1), or (N, 2) with a table for each axis.
     """
     key = facing * controls.actions + action
     return controls.turn.take(key), table.take(controls.strides.take(key, axis=0) + start + pos)

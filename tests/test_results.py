@@ -128,7 +128,7 @@ def test_the_table_of_the_fastest_is_printed_by_its_command(capsys):
 
 
 def test_trials_are_printed_and_added(tiny, tmp_path, monkeypatch, capsys):
-    """Scores of a run's last evaluation until then; columns that not all seeds came to are empty."""
+    """Scores between evaluations are interpolated; columns that not all seeds came to are empty."""
     trials.main(trials.Config())
     assert capsys.readouterr().out in (ROOT / "docs/tuning.md").read_text()
     monkeypatch.chdir(tmp_path)
@@ -149,8 +149,16 @@ def test_trials_are_printed_and_added(tiny, tmp_path, monkeypatch, capsys):
     trials.main(trials.Config())
     assert capsys.readouterr().out.splitlines()[-2:] == [
         "| `other` | 1 |  | 0.50 |  |  |",
-        "| `new` | 2 | 0.38 | 0.38 | 0.88 |  |",
+        "| `new` | 2 | 0.38 | 0.66 | 0.88 |  |",
     ]
+
+
+@pytest.mark.parametrize(
+    ("millions", "score"), [(1.0, 0.2), (1.5, 0.3), (2.0, 0.4), (2.1, 0.4), (0.9, np.nan), (2.2, np.nan)]
+)
+def test_scores_between_evaluations(millions, score):
+    """Linear, and up to a twentieth after the last one."""
+    assert trials.score_at({1_000_000: 0.2, 2_000_000: 0.4}, millions) == pytest.approx(score, nan_ok=True)
 
 
 def test_the_frontier_is_printed_and_drawn(capsys, tmp_path):

@@ -281,3 +281,14 @@ def check_final(env_id, final):
     else:
         assert final["success"] == 1
         assert round(final["reward"] / 0.1) in (1, 3)
+
+
+def test_without_a_seed_the_level_is_not_known():
+    """Gymnasium then draws a seed of 128 bits."""
+    envs = gym.make_vec("MortarMayhem-v0", 2, obs_type="vector")
+    env = gym.make("MortarMayhem-v0", obs_type="vector")
+    envs.reset()
+    env.reset()
+    assert (envs.unwrapped.oracle()["seed"].tolist(), env.unwrapped.oracle()["seed"]) == ([-1, -1], -1)
+    envs.reset(seed=[2**62, 3])
+    assert envs.unwrapped.oracle()["seed"].tolist() == [2**62, 3]
