@@ -527,7 +527,7 @@ def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, V
     )
     print(
         f"Of {counts.total()} rows tested, {counts['holds']} hold and {counts['does not hold']} do not "
-        f"({sum(stars.values())} of these with a star), "
+        f"({sum(stars.values())} of these {counts['holds'] + counts['does not hold']} with a star), "
         f"{counts['not decided']} are not decided, {counts['not learned']} not learned. {lacks} more were not run."
     )
     for table in (tested, not_run):

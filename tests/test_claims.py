@@ -275,7 +275,7 @@ def test_what_is_learned_is_judged_by_all_runs_without_memory(monkeypatch, capsy
 
     monkeypatch.setattr(learning, "result_of", result_of)
     claims.main(claims.Config(claims=(claim,), report=True))
-    assert f" hold and 0 do not (0 of these with a star), {counts}" in capsys.readouterr().out
+    assert f" hold and 0 do not (0 of these 0 with a star), {counts}" in capsys.readouterr().out
 
 
 def test_a_statement_stands_once_above_its_claims():
@@ -320,8 +320,8 @@ def test_in_how_many_rows_statements_hold(monkeypatch, capsys):
     assert capsys.readouterr().out.splitlines()[:2] == [
         "Of 4 statements tested, 1 hold in all their rows and 1 in some (1 of which do not hold in others); of the "
         "others, 1 do not hold, 1 are not decided or not learned.",
-        "Of 8 rows tested, 3 hold and 2 do not (2 of these with a star), 2 are not decided, 1 not learned. 0 more were "
-        "not run.",
+        "Of 8 rows tested, 3 hold and 2 do not (2 of these 5 with a star), 2 are not decided, 1 not learned. 0 more "
+        "were not run.",
     ]
 
 
