@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 
 from ppo_utils.checkpoints import SCRIPT_NAME, import_script
+from ppo_utils.flags import check_bounds
 from ppo_utils.memory_adapters import ScriptAdapter
 from ppo_utils.memory_check import check
 from ppo_utils.runs import parse_args
@@ -36,7 +37,8 @@ def main() -> int:
         raise ValueError(f"the script {given.script} must be named ppo_NAME.py")
     sys.path.insert(0, str(path.parent))  # before this folder, which may have a script of the same name
     script = import_script({"script": path.stem}, given.script)
-    args = parse_args(script.Args, script.PRESETS, given.flags)
+    args = parse_args(script.Args, getattr(script, "PRESETS", {}), given.flags)
+    check_bounds(args)
     torch.manual_seed(args.seed)
     report = check(ScriptAdapter(script, args))
     print(report)

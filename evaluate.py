@@ -197,7 +197,7 @@ def main(config: Config) -> None:
     if config.json is not None:
         if not os.path.isdir(os.path.dirname(config.json) or "."):
             raise ValueError(f"there is no folder {os.path.dirname(config.json)} to write to")
-        if os.path.isdir(config.json):
+        if Path(config.json).is_dir():  # the current folder, if it is empty
             raise ValueError(f"--json {config.json} is a folder; give a file to write to")
     if config.curves:
         from ppo_utils.curves import draw_curves  # it needs matplotlib; to play, nothing else has to be installed

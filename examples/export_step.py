@@ -26,7 +26,7 @@ import ppo_gru
 import ppo_trxl
 from ppo_utils.acting import Player
 from ppo_utils.errors import RunError
-from ppo_utils.terminal import one_line_exit
+from ppo_utils.terminal import one_line_exit, open_streams
 
 
 @dataclass
@@ -48,9 +48,9 @@ class RecurrentStep(nn.Module):
 
     def forward(self, obs: dict[str, Tensor], hidden: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
         """Map parts (1, ...) and the hidden state (1, P, D)."""
-        x = self.agent.encoder(obs)
-        y, hidden = self.agent.memory.recur(x[:, None], hidden)
-        policy, value, _ = self.agent.heads(y[:, 0], obs)
+        state = ppo_gru.MemoryState(now=0, hidden=hidden, stored=hidden[None])
+        y, hidden = self.agent.memory.step(state, self.agent.encoder(obs))
+        policy, value, _ = self.agent.heads(y, obs)
         return [branch.logits for branch in policy], value, hidden
 
     def beginning(self) -> tuple[Tensor, ...]:
@@ -100,17 +100,19 @@ STEPS = {ppo_gru.Agent: RecurrentStep, ppo_trxl.Agent: TransformerStep}
 
 
 def main(config: Config) -> None:
-    """Write the program; raise ValueError for an agent of another script, and what `Player` raises."""
+    """Write the program; raise ValueError for an agent of another script, OSError, and what `Player` raises."""
     player = Player(config.checkpoint)
     kind = STEPS.get(type(player.agent))
     if kind is None:
         raise ValueError("only agents of ppo_gru.py and ppo_trxl.py can be exported; write a step like theirs here")
     step = kind(player.agent).eval()
+    Path(config.out).touch()  # before the work, where it cannot be written
     obs = {name: torch.from_numpy(part) for name, part in player.envs.observation_space.sample().items()}
     torch.export.save(torch.export.export(step, (obs, *step.beginning())), config.out)
     print(f"wrote {config.out}")
 
 
 if __name__ == "__main__":
+    open_streams()
     with one_line_exit(ValueError, OSError, ImportError, gym.error.Error, RunError):
         main(tyro.cli(Config))

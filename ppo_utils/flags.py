@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import re
 import shlex
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
@@ -13,7 +14,6 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from memory_gym_envs.mystery_path import VARIANTS as MYSTERY_PATH
 from ppo_utils.processes import rank_and_size
-from ppo_utils.scores import bare_id
 
 type_hints = functools.cache(get_type_hints)  # a program that plans hundreds of trainings asks for each
 LARGEST = 3.4e38  # of weights: in float32, what is larger is infinite
@@ -189,7 +189,9 @@ def check_args(args: RunArgs) -> None:
     if args.anneal_steps is None:
         args.anneal_steps = args.total_timesteps
     if args.vector_frequencies is None:  # an agent that remembers tiles has to tell neighbours apart
-        args.vector_frequencies = 4 if args.obs_type == "vector" and bare_id(args.env_id) in MYSTERY_PATH else 0
+        *package, bare = re.split("[:/]", args.env_id)
+        is_ours = {*package} <= {"memory_gym_envs"} and bare in MYSTERY_PATH
+        args.vector_frequencies = 4 if is_ours and args.obs_type == "vector" else 0
     if args.refresh_memory and args.update_epochs == 1:
         raise ValueError("--refresh-memory needs --update-epochs above 1: the first epoch has fresh memory")
     batch_size = args.num_envs * args.num_steps

@@ -193,9 +193,10 @@ class CommandList(SameStepWrapper):
         super().__init__(env)
         parts = {**named(env.single_observation_space)}
         self._part = next((name for name in (OBSERVATION, "vector_observation") if name in parts), None)
-        if not is_act_task(env) or self._part is None:
+        commands = gym.spaces.Box(0.0, 1.0, (VECTOR_COMMANDS, 9), np.float32)
+        vector = parts.pop(self._part, None)
+        if not is_act_task(env) or vector is None or vector.shape[0] < math.prod(commands.shape):
             raise ValueError(f"CommandList needs what an act task of Mortar Mayhem observes, not {env}")
-        vector, commands = parts.pop(self._part), gym.spaces.Box(0.0, 1.0, (VECTOR_COMMANDS, 9), np.float32)
         self._others = vector.shape[0] - math.prod(commands.shape)  # number of entries before the commands
         if self._others:
             low, high = vector.low[: self._others], vector.high[: self._others]

@@ -90,7 +90,7 @@ def test_an_observation_of_another_space(trained):
 
 
 @pytest.mark.parametrize(("script", "changes"), [
-    (ppo_gru, {"num_layers": 2}), (ppo_gru, {"memory": "lstm"}),
+    (ppo_gru, {"num_layers": 2}), (ppo_gru, {"memory": "lstm"}), (ppo_gru, {"memory": "none"}),
     (ppo_trxl, {"trxl_positional_encoding": "learned", "trxl_query_position": True}),
     (ppo_trxl, {"trxl_positional_encoding": "relative", "trxl_gate": "gru", "trxl_layer_norm": "post"}),
 ])  # fmt: skip
@@ -120,6 +120,14 @@ def test_a_step_is_exported(trained, tmp_path, script, changes):
         if t == 25:  # a new episode: the state begins as it did
             agent.memory.reset(memory, torch.tensor([True]))
             state = beginning
+
+
+def test_where_a_step_cannot_be_written(trained, tmp_path, monkeypatch):
+    """It says so before the work."""
+    path = str(trained(ppo_gru, 1, env_id="MysteryPath-Grid-v0"))
+    monkeypatch.delattr(torch.export, "export")
+    with pytest.raises(OSError, match=r"No such file or directory: .*step\.pt2"):
+        export_step.main(export_step.Config(path, str(tmp_path / "none" / "step.pt2")))
 
 
 def test_who_cannot_be_exported(trained, monkeypatch):

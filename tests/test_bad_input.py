@@ -181,7 +181,7 @@ def test_what_does_not_fit(tiny, monkeypatch, error):
         raise error
 
     monkeypatch.setattr(ppo_gru.Rollout, "allocate", full)
-    changes = {"num_envs": 128, "frame_stack": 7, "total_timesteps": 4096, "checkpoint_interval": 100}
+    changes = {"num_envs": 128, "frame_stack": 7, "seq_len": 8, "total_timesteps": 4096, "checkpoint_interval": 100}
     message = setup_error(tiny(env_id="CueRecall-v0", update_epochs=9, **changes))
     assert message == "this does not fit in the memory of cpu; use less of --frame-stack 7 --num-envs 128"
 

@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import shlex
 import subprocess
 import sys
 import xml.etree.ElementTree
@@ -861,6 +862,7 @@ BAD = {
     "MODEL --max-steps 0": "--max-steps is 0",
     "MODEL --json no/where.json": "there is no folder no to write to",
     "MODEL --json empty": "--json empty is a folder; give a file to write to",
+    "MODEL --json ''": "--json  is a folder; give a file to write to",
     "MODEL --metrics coins": "not every episode reported coins; all reported return, length, reward",
     "--curves nowhere": "there is no run folder nowhere",
     "--curves empty": "empty holds no curves",
@@ -880,7 +882,7 @@ def test_bad_input(agents, tmp_path):
     (tmp_path / "results/run.json.gz").touch()
     write_old_events("old", 1)
     for line, fault in BAD.items():
-        words = line.replace("MODEL", f"{agents[0]}/model.pt --levels 1").replace("RUN", agents[0]).split()
+        words = shlex.split(line.replace("MODEL", f"{agents[0]}/model.pt --levels 1").replace("RUN", agents[0]))
         with pytest.raises((ValueError, OSError), match=fault):
             evaluate.main(evaluate.tyro.cli(evaluate.Config, args=words))
 

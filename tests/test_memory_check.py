@@ -455,9 +455,16 @@ def test_the_program(arguments, code, words, capsys, monkeypatch):
     assert words in capsys.readouterr().out
 
 
-def test_the_program_without_a_script(monkeypatch):
-    monkeypatch.setattr("sys.argv", ["check_memory.py", "ppo_lru.py"])
-    with pytest.raises(ValueError, match=r"there is no ppo_lru.py; give a script, such as ppo_gru.py"):
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("ppo_lru.py", r"^there is no ppo_lru.py; give a script, such as ppo_gru.py$"),
+        (f"{ROOT}/ppo_gru.py --hidden-size 0", r"^--hidden-size is 0; it must be 1 or more$"),
+    ],
+)
+def test_the_program_without_a_script_or_with_wrong_flags(arguments, message, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["check_memory.py", *arguments.split()])
+    with pytest.raises(ValueError, match=message):
         check_memory.main()
 
 

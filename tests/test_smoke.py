@@ -188,6 +188,8 @@ def test_trains_on_vectors_and_their_frequencies(tiny, scalars):
     [
         ({"env_id": "MysteryPath-v0"}, 4),
         ({"env_id": "memory_gym_envs/MysteryPath-Grid-v0"}, 4),
+        ({"env_id": "memory_gym_envs:MysteryPath-v0"}, 4),
+        ({"env_id": "another/MysteryPath-v0"}, 0),
         ({"env_id": "Endless-MysteryPath-v0", "vector_frequencies": 0}, 0),
         ({"env_id": "MysteryPath-v0", "obs_type": "pixels"}, 0),
         ({"env_id": "MortarMayhem-v0"}, 0),

@@ -206,6 +206,13 @@ def test_wrong_arguments(wrapper, arguments, message):
     assert "\n" not in str(error.value)
 
 
+def test_commands_of_another_vector():
+    """Of an act task whose vector is too short to hold them."""
+    envs = CommandList(make("MortarMayhemB-Grid-v0", obs_type="vector"))
+    with pytest.raises(ValueError, match="^CommandList needs what an act task of Mortar Mayhem observes, not Command"):
+        CommandList(envs)
+
+
 # ---- grayscale frame stacks ----
 
 
