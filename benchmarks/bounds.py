@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, befo
 
 from learning import FIRST_TEST_LEVEL, TEST_LEVELS
 from memory_gym_envs.players import choices, player
+from ppo_utils.terminal import one_line_exit
 from suites import FULL, SMALL, Task
 from tables import BOUNDS, scored_levels
 
@@ -73,4 +74,5 @@ def main(out: Path = BOUNDS, levels: int = TEST_LEVELS, max_steps: int = MAX_STE
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with one_line_exit(OSError):
+        tyro.cli(main)

@@ -41,7 +41,7 @@ import tables
 from ppo_utils.run_logs import RunLog, align
 from ppo_utils.terminal import one_line_exit
 from suites import Task
-from tables import LEVEL, Comparison
+from tables import ALPHA, Comparison
 
 ALL_VISIBLE = {"agent_visible": True, "coins_visible": True, "exit_visible": True}
 ENDS_SHOWN = {"show_origin": True, "show_goal": True}
@@ -413,7 +413,7 @@ def verdict(claim: Claim, pairs: list[Comparison]) -> Verdict:
         Verdict("does not hold", min(1, len(pairs) * min(against, default=1))),
         Verdict("holds", max(above) if claim.expects_difference and len(above) == len(pairs) else 1),
     ):
-        if found.p_value < LEVEL:
+        if found.p_value < ALPHA:
             return found
     is_plain = len(pairs) == 1 and claim.times == 1
     return Verdict("not decided", interval=pairs[0].interval if is_plain else None)
@@ -444,9 +444,9 @@ def is_learned(claim: Claim, runs: dict[str, list[RunLog]], without: list[RunLog
 
 
 def holm(p_values: list[float]) -> list[bool]:
-    """Return which of these p-values stand at a family-wise error of `LEVEL` (Holm, 1979)."""
+    """Return which of these p-values stand at a family-wise error of `ALPHA` (Holm, 1979)."""
     order = np.argsort(p_values)
-    limits = LEVEL / np.arange(len(order), 0, -1)
+    limits = ALPHA / np.arange(len(order), 0, -1)
     passed = np.cumprod(np.array(p_values)[order] <= limits).astype(bool)  # from the smallest to the first that fails
     return passed[np.argsort(order)].tolist()
 

@@ -17,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of 
 
 import learning
 from ppo_utils.run_logs import align
+from ppo_utils.terminal import one_line_exit
 
 COUNT = 10  # commands of the tasks' default options
 LEARNED_SHARE = 0.9  # a command is learned when so many of those who come to it carry it out
@@ -72,4 +73,5 @@ def main(out: Path = Path("docs/frontier.png")) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with one_line_exit(OSError):
+        tyro.cli(main)

@@ -18,6 +18,7 @@ import argparse
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -235,10 +236,17 @@ class Fuzz:
             self.differ[kind] += 1
 
 
+def executable(path: str) -> str:
+    """Return the path of a program that can be run; raise ValueError for another."""
+    if shutil.which(path) is None:
+        raise ValueError
+    return path
+
+
 def main() -> int:
     """Run for a while, and print what was found."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--original", help="an interpreter that has memory-gym (default: one is made)")
+    parser.add_argument("--original", type=executable, help="an interpreter that has memory-gym (default: one is made)")
     parser.add_argument("--minutes", type=float, default=10.0, help="time of the run (default: 10)")
     parser.add_argument("--episodes", type=int, default=10**9, help="end after so many (default: no limit)")
     parser.add_argument("--seed", type=int, default=0, help="of the draws (default: 0)")
@@ -246,6 +254,10 @@ def main() -> int:
     parser.add_argument("--ids", nargs="+", help="ids to draw from (default: all)")
     args = parser.parse_args()
     sys.path.insert(0, str(ROOT))
+    import memory_gym_envs
+
+    if unknown := [each for each in args.ids or () if each not in memory_gym_envs.IDS]:
+        parser.error(f"there is no {unknown[0]}; there are {', '.join(memory_gym_envs.IDS)}")
     with tempfile.TemporaryDirectory() as folder:
         fuzz = Fuzz(args.original or make_original(folder), args.seed)
         number, end = args.first, time.monotonic() + 60 * args.minutes

@@ -267,9 +267,9 @@ def log_of(config: Training, plan: Plan) -> Path:
 def steps_so_far(config: Training, plan: Plan) -> int:
     """Return how many steps a training has done, by the script's progress bar at the end of its log."""
     log = log_of(config, plan)
-    bars = re.findall(r"([\d.]+)([kM]?)/[\d.]+[kM]? \[", log.read_text()[-1000:] if log.exists() else "")
+    bars = re.findall(r"([\d.]+)([kMG]?)/[\d.]+[kMG]? \[", log.read_text()[-1000:] if log.exists() else "")
     number, unit = bars[-1] if bars else ("0", "")
-    return int(float(number) * {"": 1, "k": 1e3, "M": 1e6}[unit])
+    return int(float(number) * {"": 1, "k": 1e3, "M": 1e6, "G": 1e9}[unit])
 
 
 def environment(config: Training, plan: Plan) -> dict[str, str]:
@@ -333,9 +333,9 @@ def write_result(config: Training, plan: Plan) -> None:
 def write_run(run: RunLog, path: str) -> None:
     """Write what tables and pictures need, in a few KB; `read_run` reads it as it reads the run's folder.
 
-    That is the machine, the arguments, the evaluations in the family's own metric, return, length and falls, those on
-    test levels too, the seconds of each iteration, and the curves UPDATE_CURVES, averaged to POINTS. Steps are kept as
-    differences, which compress better.
+    That is the machine, the commit, the arguments, the evaluations in the family's own metric, return, length and
+    falls, those on test levels too, the seconds of each iteration, and the curves UPDATE_CURVES, averaged to POINTS.
+    Steps are kept as differences, which compress better.
     """
     metrics = (own_metric(run.args["env_id"]), "return", "length", "num_fails")
     names = [f"{levels}/{name}" for levels in ("eval", "test") for name in metrics]
@@ -352,7 +352,8 @@ def write_run(run: RunLog, path: str) -> None:
     part = Path(f"{path}.part")
     try:
         with gzip.open(part, "wt") as file:
-            json.dump({"machine": run.machine, "args": run.args, "curves": curves}, file, separators=(",", ":"))
+            about = {"machine": run.machine, "commit": commit(), "args": run.args}
+            json.dump({**about, "curves": curves}, file, separators=(",", ":"))
         os.replace(part, path)  # a file that is there is complete
     finally:
         part.unlink(missing_ok=True)
@@ -383,6 +384,15 @@ def machine() -> str:
     processor = models[0] if models else platform.processor() or platform.machine()
     gpu = f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
     return f"{processor}, {os.cpu_count()} cores{gpu}, PyTorch {version('torch')}"
+
+
+def commit() -> str:
+    """Name the commit of this code, with "-dirty" where it has been changed; empty outside of a git repository."""
+    line = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
+    try:
+        return subprocess.run(line, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
 
 
 def train_missing(config: Training, wanted: list[Plan]) -> None:
@@ -453,9 +463,17 @@ def plans_of(config: Config) -> dict[tuple[str, str, int], Plan]:
 
 
 def stored_results(**config: Any) -> dict[str, Runs]:
-    """Return the runs in benchmarks/results that a `Config` describes, by task and agent."""
+    """Return the runs in benchmarks/results that a `Config` describes, by task and agent.
+
+    Raises SystemExit if an agent has some of the seeds, but not all: a table would not tell.
+    """
     stored = Config(results=ROOT / "benchmarks/results", **config)
-    return results_of(stored, plans_of(stored))
+    tasks = results_of(stored, plans_of(stored))
+    for task, agents in tasks.items():
+        for agent, runs in agents.items():
+            if runs and len(runs) < len(stored.seeds):
+                raise SystemExit(f"{stored.results} has {len(runs)} of {len(stored.seeds)} seeds of {agent} in {task}")
+    return tasks
 
 
 def results_of(config: Config, plans: dict[tuple[str, str, int], Plan]) -> dict[str, Runs]:
@@ -471,22 +489,25 @@ def results_of(config: Config, plans: dict[tuple[str, str, int], Plan]) -> dict[
 def write_csv(results: Path, path: Path) -> int:
     """Write the scores of all runs to a table, a line for each evaluation, and return the number of runs.
 
-    On test levels they are those of the tables: of new levels only, where there are any.
+    On test levels they are those of the tables: of new levels only, where there are any. Runs with the same `settings`,
+    a checksum, are seeds of one agent; exp_name is its name when it was trained.
     """
     names = ("env_id", "env_options", "exp_name", "script", "seed", "total_timesteps")
     files = sorted(results.glob("*/*.json.gz"))
     with path.open("w", newline="") as file:
         table = csv.writer(file)
-        table.writerow(("run", *names, "levels", "metric", "step", "hours", "mean", "episodes"))
+        table.writerow(("run", *names, "settings", "levels", "metric", "step", "hours", "mean", "episodes"))
         for each in files:
             run = read_run(str(each))
+            of_agent = sorted(settings(run.args | {"seed": ""}).items())
+            checksum = f"{zlib.crc32(json.dumps(of_agent).encode()):08x}"
             for curve, (steps, scores) in run.curves.items():
                 levels, _, metric = curve.partition("/")
                 if levels in ("eval", "test"):
                     if levels == "test":
                         scores = tables.final_scores(metric, [run])
                     about = [each.name.removesuffix(".json.gz"), *(run.args[name] for name in names)]
-                    about += [levels.replace("eval", "development"), metric]
+                    about += [checksum, levels.replace("eval", "development"), metric]
                     hours = run.hours(np.asarray(steps)) if run.has_seconds() else np.full(len(steps), math.nan)
                     for step, hour, score in zip(steps, hours, scores, strict=True):
                         table.writerow((*about, step, f"{hour:.4f}", f"{score.mean():.6g}", score.size))

@@ -1,15 +1,23 @@
 """Draw the pictures of docs/memory.md: where the gradient of an update flows, and what it takes as it was stored.
 
-python benchmarks/memory_pictures.py
+    python benchmarks/memory_pictures.py
+
+Steps are counted from the first of the rollout that an update learns from.
 """
 
+import sys
 from itertools import pairwise
 from pathlib import Path
 
+import tyro
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch, Patch, Rectangle
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
+
+from ppo_utils.terminal import one_line_exit
 
 FRESH, STORED, OLD, UNUSED = "#a6cdf0", "#ffdfb0", "#f0a060", "#f2f2f2"
 GRADIENT, EDGE = "#1f5fa8", "#888888"
@@ -106,6 +114,12 @@ def transformer() -> Figure:
     return figure
 
 
-if __name__ == "__main__":
+def main(folder: Path = Path("docs")) -> None:
+    """Draw both to a folder."""
     for name, draw in (("memory_gru", recurrent), ("memory_trxl", transformer)):
-        draw().savefig(Path(__file__).parent.parent / "docs" / f"{name}.png", dpi=110)
+        draw().savefig(folder / f"{name}.png", dpi=110)
+
+
+if __name__ == "__main__":
+    with one_line_exit(OSError):
+        tyro.cli(main)

@@ -27,6 +27,8 @@ import memory_gym_envs  # noqa: F401 (registers the ids)
 from learning import FIRST_TEST_LEVEL
 from memory_gym_envs.mortar_mayhem.drawing import SYMBOL, symbols
 from ppo_utils.acting import Player
+from ppo_utils.errors import RunError
+from ppo_utils.terminal import one_line_exit
 
 VIEW, GAP, LABEL = 336, 8, 44  # pixels: a view's side, white between views, margins with labels
 MILLISECONDS = 160  # that a frame is shown
@@ -140,4 +142,5 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    with one_line_exit(ValueError, OSError, ImportError, gym.error.Error, RunError):
+        main(tyro.cli(Config))

@@ -19,6 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of 
 import learning
 import tables
 from ppo_utils.run_logs import Runs, align
+from ppo_utils.terminal import one_line_exit
 from suites import COLORS, LONGER, TASKS
 
 AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, before", "TrXL+")
@@ -117,4 +118,5 @@ def main(folder: Path = Path("docs")) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with one_line_exit(OSError):
+        tyro.cli(main)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import scipy.stats
+import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
 
@@ -22,7 +23,7 @@ from suites import TASKS
 
 ENTRIES = Path(__file__).with_name("speedrun.csv")
 SEEDS = (1, 2, 3, 4, 5)
-LEVEL = 0.01  # of the test that the mean is above the target
+ALPHA = 0.01  # significance level of the test that the mean is above the target
 SMALLEST_PRINTED = 0.0001  # p-value
 HEADING = """| task | target | agent | score | p <= | steps | minutes | date, commit |
 |---|---:|---|---:|---:|---:|---:|---|"""
@@ -54,11 +55,11 @@ def row(entry: Entry) -> str:
     """
     tasks, agents = (entry.task,), (entry.agent,)
     (runs,) = learning.stored_results(tasks=tasks, agents=agents, steps=entry.steps, seeds=SEEDS)[entry.task].values()
-    if len(runs) < len(SEEDS):
-        raise SystemExit(f"benchmarks/results has {len(runs)} of {len(SEEDS)} seeds of {entry.agent} in {entry.task}")
+    if not runs:
+        raise SystemExit(f"benchmarks/results has no runs of {entry.agent} in {entry.task}, {entry.steps:,} steps")
     scores = tables.final_scores(TASKS[entry.task].score, runs)  # (R, M, E)
     p_value = probability(scores.mean((1, 2)), entry.target)
-    if not p_value < LEVEL:  # of equal scores, it is NaN
+    if not p_value < ALPHA:  # of equal scores, it is NaN
         raise SystemExit(f"{entry.agent} in {entry.task} is not above {entry.target:g}: p = {p_value:.3f}")
     cells = [
         entry.task,
@@ -82,4 +83,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -25,7 +25,7 @@ from ppo_utils.scores import RESAMPLES, iqm
 from suites import COLORS, TASKS, Task
 
 BOUNDS, THESIS, NEW_LEVELS = (Path(__file__).with_name(f"{name}.csv") for name in ("bounds", "thesis", "new_levels"))
-LEVEL = 0.05  # agents differ if the p-value is below that
+ALPHA = 0.05  # significance level: agents differ if the p-value is below it
 SHOWN = ("show_origin", "show_goal")  # options that change how a level looks, not what it is
 RIVALS = ("no memory", "GRU")  # with which the others are compared over all tasks
 NAMES_APART = 0.075  # between the names beside the curves' ends, as a share of the axis
@@ -137,12 +137,12 @@ class Comparison:
 
     errors: float
     p_value: float  # two-sided
-    interval: tuple[float, float] | None = None  # of the difference, at a level of 1 - LEVEL; None for a single seed
+    interval: tuple[float, float] | None = None  # of the difference, 1 - ALPHA; None for a single seed
 
     @property
     def is_ahead(self) -> bool:
         """Return whether the first one is decidedly higher."""
-        return self.errors > 0 and self.p_value < LEVEL
+        return self.errors > 0 and self.p_value < ALPHA
 
     @classmethod
     def of(cls, higher: np.ndarray, lower: np.ndarray) -> "Comparison":
@@ -164,7 +164,7 @@ class Comparison:
         error = math.sqrt(variance)
         of_all = variance**2 / sum(part**2 / each for part, each in zip(parts, freedom, strict=True))
         student = scipy.stats.t(min(of_all, freedom[0] + freedom[1]))
-        margin = error * student.isf(LEVEL / 2)
+        margin = error * student.isf(ALPHA / 2)
         p_value = 2 * student.sf(abs(difference / error))
         return cls(difference / error, p_value, (difference - margin, difference + margin))
 

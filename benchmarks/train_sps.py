@@ -25,12 +25,16 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import gymnasium as gym
 import torch
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
+from ppo_utils.errors import RunError
+from ppo_utils.flags import PositiveInt, check_bounds
 from ppo_utils.runs import close, parse_args
+from ppo_utils.terminal import one_line_exit
 
 
 @dataclass
@@ -41,11 +45,11 @@ class Config:
     """the script, without .py"""
     env_id: str = "MortarMayhem-Grid-v0"
     """a Memory Gym id with pixels"""
-    num_envs: int = 32
+    num_envs: PositiveInt = 32
     """lanes"""
     num_steps: list[int] = field(default_factory=lambda: [128, 512])
     """steps of a rollout, a table row each"""
-    rounds: int = 3
+    rounds: PositiveInt = 3
     """how often bound and script are timed in turn"""
     chunks: list[int] = field(default_factory=lambda: [64, 128, 256, 512])
     """sizes of piece that the bound may choose from"""
@@ -117,7 +121,8 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, in
 
 
 def main(config: Config) -> None:
-    """Print a Markdown table, a row per rollout length."""
+    """Print a Markdown table, a row per rollout length. Raises ValueError, and what a script's `setup` raises."""
+    check_bounds(config)
     print(f"{config.script} on {config.env_id} {config.flags}, {torch.get_num_threads()} threads\n")
     print("| lanes x steps | steps/s | distinct | convolutions alone | share | encoder alone | share | best piece |")
     print("|---|---|---|---|---|---|---|---|")
@@ -133,4 +138,5 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    with one_line_exit(ValueError, OSError, ImportError, gym.error.Error, RunError):
+        main(tyro.cli(Config))

@@ -25,6 +25,7 @@ import ppo_gru
 import tables
 from ppo_utils.evaluation import beginnings
 from ppo_utils.flags import RunArgs
+from ppo_utils.terminal import one_line_exit
 from suites import COLORS, LONGER, TASKS
 
 AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, low rate", "TrXL+")
@@ -107,4 +108,5 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    with one_line_exit(OSError):
+        main(tyro.cli(Config))

@@ -53,6 +53,8 @@ def add(agent: str, run: RunLog) -> None:
     task, seed = run.args["env_id"], run.args["seed"]
     if task not in COLUMNS:
         raise SystemExit(f"the tables have {', '.join(COLUMNS)}, not {task}")
+    if run.args["env_options"] != "{}":
+        raise SystemExit(f"the tables have tasks with default options, not {run.args['env_options']}")
     if f"eval/{TASKS[task].score}" not in run.curves:
         raise SystemExit(f"{run.path} has no evaluations; train with --eval-interval")
     with TRIALS.open(newline="") as file:

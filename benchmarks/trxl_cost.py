@@ -15,6 +15,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import gymnasium as gym
 import torch
 import torch.nn.functional as F
 import tyro
@@ -22,7 +23,10 @@ import tyro
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
 import ppo_trxl
+from ppo_utils.errors import RunError
+from ppo_utils.flags import PositiveInt, check_bounds
 from ppo_utils.runs import close
+from ppo_utils.terminal import one_line_exit
 
 
 @dataclass
@@ -31,11 +35,11 @@ class Config:
 
     env_id: str = "MortarMayhem-v0"
     """an id whose episodes are long"""
-    num_steps: int = 512
+    num_steps: PositiveInt = 512
     """steps of a rollout"""
     windows: tuple[int, ...] = (64, 256, 1024)
     """windows to time a step with"""
-    repeats: int = 40
+    repeats: PositiveInt = 40
     """steps to take the median of"""
 
 
@@ -113,7 +117,8 @@ def step_times(config: Config, window: int) -> tuple[float, float]:
 
 
 def main(config: Config) -> None:
-    """Print both tables."""
+    """Print both tables. Raises ValueError, and what a script's `setup` raises."""
+    check_bounds(config)
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)  # the run folder goes there
         shares(config)
@@ -124,4 +129,5 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    with one_line_exit(ValueError, OSError, ImportError, gym.error.Error, RunError):
+        main(tyro.cli(Config))

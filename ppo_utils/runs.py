@@ -142,8 +142,8 @@ def report_out_of_memory(
             raise
         if isinstance(error, RuntimeError) and not re.search("allocate|out of memory|overflowed", str(error)):
             raise
-        harmless = ("seed", "seq_len", "total_timesteps", "start_level", "num_levels", "anneal_steps", "num_minibatches")
-        harmless += ("update_epochs", "checkpoint_interval", "eval_interval", "eval_max_steps", "max_steps")
+        harmless = ("seed", "total_timesteps", "start_level", "num_levels", "anneal_steps", "num_minibatches")
+        harmless += ("seq_len", "update_epochs", "checkpoint_interval", "eval_interval", "eval_max_steps", "max_steps")
         sizes = [each for each in fields(args) if type(each.default) is int and each.name not in harmless]
         usual = [each.name for each in sizes if each.name in ("num_envs", "num_steps", "levels", "repeats")]
         large = [each.name for each in sizes if getattr(args, each.name) > each.default] or usual

@@ -34,6 +34,17 @@ def test_endless_episodes_are_cut_short():
     assert np.median(longer) > 1.5
 
 
+def test_a_stopped_program_leaves_the_file_as_it_was(monkeypatch, tmp_path):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    (tmp_path / "bounds.csv").write_text("before")
+    monkeypatch.setattr(bounds, "play", stop)
+    with pytest.raises(KeyboardInterrupt):
+        bounds.main(tmp_path / "bounds.csv")
+    assert (tmp_path / "bounds.csv").read_text() == "before"
+
+
 def test_the_file(tmp_path):
     bounds.main(tmp_path / "bounds.csv", levels=20, max_steps=5)
     head, *rows = (tmp_path / "bounds.csv").read_text().splitlines()

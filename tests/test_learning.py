@@ -1,6 +1,7 @@
 """benchmarks/learning.py: its command lines, and which runs it need not train again."""
 
 import fcntl
+import gzip
 import json
 import os
 import re
@@ -164,6 +165,7 @@ def test_a_stopped_run_goes_on_and_a_whole_one_is_kept(tmp_path, monkeypatch, ca
         tqdm.write(f"trained {plan}")
 
     monkeypatch.setattr(learning, "train", train)
+    monkeypatch.setattr(learning, "commit", lambda: "abc1234")
     monkeypatch.setattr(subprocess, "run", lambda line, **how: programs.run_command(*line[1:], **how["env"]))
 
     assert [learning.is_complete(each) for each in trainings()] == [False]
@@ -321,6 +323,8 @@ def test_a_log_tells_how_far_its_training_is(tmp_path):
             assert learning.steps_so_far(config, plan) == seen
         bar.close()
     assert learning.steps_so_far(config, other) == 0, "another seed has not begun"
+    learning.log_of(config, other).write_text("10%|#   | 1.10G/11.0G [10:00<99:00, 12.3k steps/s]")
+    assert learning.steps_so_far(config, other) == 1_100_000_000
     longer = learning.plan(replace(config, steps=12_000_000), learning.TASKS["mortar-mayhem"], "GRU", 1)
     assert learning.steps_so_far(config, longer) == 0, "nor has a longer training"
 
@@ -338,17 +342,63 @@ def test_results_as_one_table(tmp_path, capsys, monkeypatch):
     (tmp_path / "X-v0").mkdir()
     learning.write_run(replace(run, curves=run.curves | seconds | test), f"{tmp_path}/X-v0/run.json.gz")
     unmeasured = {"eval/return": (np.array([100]), scores[:1])}  # as earlier versions did, which had no seconds
-    learning.write_run(RunLog("", args | {"seed": "4"}, unmeasured), f"{tmp_path}/X-v0/unmeasured.json.gz")
+    # Another seed, which has an older name.
+    other = args | {"seed": "4", "exp_name": "before"}
+    learning.write_run(RunLog("", other, unmeasured), f"{tmp_path}/X-v0/unmeasured.json.gz")
+    learning.write_run(RunLog("", args | {"gamma": "0.9"}, unmeasured), f"{tmp_path}/X-v0/other.json.gz")
     learning.main(learning.Config(results=tmp_path, csv=tmp_path / "all.csv"))
-    assert capsys.readouterr().out == f"{tmp_path}/all.csv: the scores of 2 runs\n"
-    assert (tmp_path / "all.csv").read_text().splitlines() == [
-        "run,env_id,env_options,exp_name,script,seed,total_timesteps,levels,metric,step,hours,mean,episodes",
-        "run,X-v0,{},GRU,ppo_gru,3,300,development,return,100,0.0100,1,8",
-        "run,X-v0,{},GRU,ppo_gru,3,300,development,return,200,0.0200,2,8",
-        "run,X-v0,{},GRU,ppo_gru,3,300,development,return,300,0.0300,3,8",
-        "run,X-v0,{},GRU,ppo_gru,3,300,test,return,300,0.0300,2,4",
-        "unmeasured,X-v0,{},GRU,ppo_gru,4,300,development,return,100,nan,1,8",
+    assert capsys.readouterr().out == f"{tmp_path}/all.csv: the scores of 3 runs\n"
+    head, another, *lines = (tmp_path / "all.csv").read_text().splitlines()
+    names = "run,env_id,env_options,exp_name,script,seed,total_timesteps,settings"
+    assert head == f"{names},levels,metric,step,hours,mean,episodes"
+    settings = lines[0].split(",")[7]
+    assert re.fullmatch("[0-9a-f]{8}", settings)
+    assert another.split(",")[7] != settings
+    assert lines == [
+        f"run,X-v0,{{}},GRU,ppo_gru,3,300,{settings},development,return,100,0.0100,1,8",
+        f"run,X-v0,{{}},GRU,ppo_gru,3,300,{settings},development,return,200,0.0200,2,8",
+        f"run,X-v0,{{}},GRU,ppo_gru,3,300,{settings},development,return,300,0.0300,3,8",
+        f"run,X-v0,{{}},GRU,ppo_gru,3,300,{settings},test,return,300,0.0300,2,4",
+        f"unmeasured,X-v0,{{}},before,ppo_gru,4,300,{settings},development,return,100,nan,1,8",
     ]
+
+
+def test_a_result_names_the_commit(tmp_path, monkeypatch):
+    monkeypatch.setattr(learning, "ROOT", tmp_path)
+    assert learning.commit() == "", "there is no repository"
+
+    def git(*words):
+        identity = ("-c", "user.name=A", "-c", "user.email=a@b.c")
+        return subprocess.run(["git", "-C", tmp_path, *identity, *words], capture_output=True, text=True, check=True)
+
+    git("init")
+    (tmp_path / "agent.py").write_text("1")
+    git("add", ".")
+    git("commit", "-m", "first")
+    first = git("rev-parse", "--short", "HEAD").stdout.strip()
+    learning.write_run(RunLog("", {"env_id": "X-v0"}, {}), f"{tmp_path}/run.json.gz")
+    with gzip.open(tmp_path / "run.json.gz") as file:
+        assert json.load(file)["commit"] == first
+    (tmp_path / "agent.py").write_text("2")
+    assert learning.commit() == f"{first}-dirty"
+
+
+def test_results_in_a_folder_with_brackets(tmp_path):
+    config = learning.Config(results=tmp_path / "a[1]")
+    plan = learning.plan(config, learning.TASKS["mortar-mayhem"], "GRU", 1)
+    folder = config.results / plan.task.env_id
+    folder.mkdir(parents=True)
+    curves = {"eval/carried_out": (np.array([100]), np.ones((1, 1, 1)))}
+    learning.write_run(RunLog("", plan.logged_args(), curves), f"{folder}/{plan.task.env_id}__GRU__1__0.json.gz")
+    assert learning.result_of(config, plan) is not None
+
+
+def test_stored_results_have_all_seeds_or_none(monkeypatch):
+    runs = {"GRU": [RunLog("", {}, {})] * 2, "TrXL": []}
+    monkeypatch.setattr(learning, "results_of", lambda config, plans: {"mortar-mayhem": runs})
+    assert learning.stored_results(tasks=("mortar-mayhem",), seeds=(1, 2)) == {"mortar-mayhem": runs}
+    with pytest.raises(SystemExit, match=r"has 2 of 3 seeds of GRU in mortar-mayhem$"):
+        learning.stored_results(tasks=("mortar-mayhem",))
 
 
 def test_hours_of_trainings_are_expected_by_those_that_are_there(tmp_path):
