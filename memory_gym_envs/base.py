@@ -339,7 +339,8 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
 
     def get_state(self) -> dict[str, Any]:
         """The lanes' arrays, options, seeds and generators, in plain values that later steps do not change."""
-        return {**super().get_state(), "made_with": dict(self.arguments), "arrays": plain(vars(self.state))}
+        made_with = {**self.arguments, "options": self.defaults}
+        return {**super().get_state(), "made_with": made_with, "arrays": plain(vars(self.state))}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Takes over a copy of what get_state() of an environment with the same arguments returned.
@@ -357,17 +358,17 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
         except (AttributeError, KeyError, TypeError) as error:
             raise ValueError(f"this is no state of {self.variant_id}: {brief(error)}") from None
         super().set_state({**rest, "settings": settings})
-        self.configure(np.arange(self.num_envs))  # for what follows from the options of all lanes
         self.state = type(self.state)(**arrays)
         self.place_tables()
 
     def _check_state(self, state: dict[str, Any]) -> None:
         """Raises ValueError if the state is of one made with other arguments, or has not what every lane needs."""
-        theirs = state["made_with"]
-        for name in self.arguments | theirs:
-            given, ours = theirs.get(name), self.arguments.get(name)
-            if given != ours:
-                raise ValueError(f"the saved state is of one with {name} {given!r}, not {ours!r}")
+        ours, theirs = {**self.arguments, "options": self.defaults}, {**state["made_with"]}
+        theirs["options"] = self.complete_options(theirs.get("options"))  # which earlier versions did not save
+        for name in ours | theirs:
+            if theirs.get(name) != ours.get(name):
+                given, wanted = (brief(each.get(name)) for each in (theirs, ours))
+                raise ValueError(f"the saved state is of one with {name} {given}, not {wanted}")
         for name in self.kept:
             given, ours = state[name], plain(getattr(self, name))
             if type(given) is not type(ours) or getattr(given, "dtype", None) != getattr(ours, "dtype", None):

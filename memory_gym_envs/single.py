@@ -121,21 +121,15 @@ class MemoryGymEnv(gym.Env):
 
     def get_state(self) -> dict[str, Any]:
         """The whole state in plain values, which later steps do not change: `set_state` goes on exactly from there."""
-        made_with = {**self.batch.arguments, "options": self.batch.defaults}
-        return {"made_with": made_with, "batch": self.batch.get_state(), "needs_reset": self._needs_reset}
+        return {"batch": self.batch.get_state(), "needs_reset": self._needs_reset}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Takes over a copy of what get_state() of an environment that was made with the same arguments returned.
 
         Raises ValueError, in one line, for any other; nothing has changed then.
         """
-        ours, before = self.get_state()["made_with"], self.batch.get_state()
+        before = self.batch.get_state()
         try:
-            for name, theirs in state["made_with"].items():
-                if name == "options":
-                    theirs = self.batch.complete_options(theirs)
-                if theirs != ours[name]:
-                    raise ValueError(f"it is of one with {name} {brief(theirs)}, not {brief(ours[name])}")
             if not isinstance(state["needs_reset"], bool):
                 raise ValueError(f"its needs_reset must be True or False, not {brief(state['needs_reset'])}")
             self.batch.set_state(state["batch"])

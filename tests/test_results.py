@@ -135,7 +135,8 @@ def test_trials_are_printed_and_added(tiny, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(trials, "TRIALS", tmp_path / "trials.csv")
     monkeypatch.setattr(trials, "COLUMNS", {"MysteryPath-Grid-v0": ((6.4e-5, 1e-4, 1.28e-4, 2e-4), ())})
     trials.TRIALS.write_text("task,agent,seed,step,score\nMysteryPath-Grid-v0,other,1,100,0.5\n")
-    scores = [dict.fromkeys(("success", "return"), np.full((2, 1), score)) for score in (0.25, 0.75, 0.5, 1.0, 0.0, 0.0)]
+    means = (0.25, 0.75, 0.5, 1.0, 0.0, 0.0)
+    scores = [dict.fromkeys(("success", "return"), np.full((2, 1), mean)) for mean in means]
     monkeypatch.setattr(runs, "level_scores", lambda *_: {k: torch.tensor(v) for k, v in scores.pop(0).items()})
     args = {"env_id": "MysteryPath-Grid-v0", "obs_type": "vector", "eval_interval": 1}
     for seed in (1, 2):

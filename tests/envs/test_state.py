@@ -120,10 +120,10 @@ def play_on(env, actions):
 @pytest.mark.parametrize(
     ("other", "message"),
     [
-        ({"id": "MysteryPath-Grid-v0"}, "it is of one with id 'MysteryPath-Grid-v0', not 'MysteryPath-v0'"),
-        ({"obs_type": "vector"}, "it is of one with obs_type 'vector', not 'pixels'"),
-        ({"num_levels": 4}, "it is of one with num_levels 4, not 0"),
-        ({"options": {"max_steps": 9}}, "it is of one with options {'max_steps': 9, "),
+        ({"id": "MysteryPath-Grid-v0"}, "of one with id 'MysteryPath-Grid-v0', not 'MysteryPath-v0'"),
+        ({"obs_type": "vector"}, "the saved state is of one with obs_type 'vector', not 'pixels'"),
+        ({"num_levels": 4}, "the saved state is of one with num_levels 4, not 0"),
+        ({"options": {"max_steps": 9}}, "the saved state is of one with options {'max_steps': 9, "),
     ],
 )
 def test_the_state_of_another_environment(other, message):
@@ -142,6 +142,7 @@ def test_the_state_of_another_environment(other, message):
         {"start_level": 4},
         {"max_episode_steps": 20},
         {"autoreset_mode": "NextStep"},
+        {"options": {"max_steps": 9}},
     ],
 )
 def test_the_state_of_another_vector_environment(other):
@@ -152,7 +153,7 @@ def test_the_state_of_another_vector_environment(other):
         each.reset(seed=0)
     before = pickle.dumps(envs.get_state())
     ((name, value),) = other.items()
-    with pytest.raises(ValueError, match=f"the saved state is of one with {name} {value!r}, not "):
+    with pytest.raises(ValueError, match=f"the saved state is of one with {name} {repr(value).rstrip('}')}.*, not "):
         envs.set_state(theirs.get_state())
     for state in ({}, None):
         with pytest.raises(ValueError, match=f"this is no state of MysteryPath-v0: {state}"):
@@ -229,7 +230,7 @@ def test_what_is_no_state():
     env = gym.make("MysteryPath-v0").unwrapped
     env.reset(seed=0)
     check_refused(env, None, "TypeError")
-    check_refused(env, {}, "KeyError('made_with')")
+    check_refused(env, {}, "KeyError('needs_reset')")
     check_refused(env, {**env.get_state(), "needs_reset": "no"}, "its needs_reset must be True or False, not 'no'")
     for change, message in (
         ({"settings": [{"arena_size": 3}]}, "MysteryPath-v0 has no option 'arena_size'"),
