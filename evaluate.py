@@ -35,14 +35,15 @@ from tqdm import tqdm
 from ppo_utils.checkpoints import Checkpoint
 from ppo_utils.environments import envs_for, is_memory_gym
 from ppo_utils.errors import RunError
-from ppo_utils.evaluation import are_trained_on, evaluate, evaluation_levels, first_after
+from ppo_utils.evaluation import are_trained_on, count_trained_on, evaluate, evaluation_levels, first_after
 from ppo_utils.flags import NonNegativeInt, PositiveInt, check_bounds
 from ppo_utils.runs import report_out_of_memory
-from ppo_utils.scores import own_metric, summary, table, task_of, tasks_of
+from ppo_utils.scores import bare_id, own_metric, summary, table, task_of, tasks_of
 from ppo_utils.terminal import one_line_exit, open_streams
 
 MOST_EPISODES = 100_000
 AT_ONCE = 1000  # episodes; more would take much memory
+MOST_COUNTED = 100_000  # levels of a training, which take ten seconds
 
 
 @dataclass
@@ -122,6 +123,23 @@ def title_of(args: dict[str, Any], config: Config) -> str:
     return f"{task_of(args)}, {levels}{', most probable actions' if config.deterministic else ''}"
 
 
+def trained_levels(args: dict[str, Any], config: Config) -> str:
+    """Say how many of the levels that are played begin as one of the training's, where that can be known.
+
+    In an endless task, none has all of its beginning in common, but what an agent gets to see of it may be.
+    """
+    training = SimpleNamespace(**args)
+    if not is_memory_gym(training.env_id) or not training.num_levels or config.new_levels:
+        return ""
+    few = training.num_levels <= MOST_COUNTED and config.env_options is None
+    if not few or bare_id(training.env_id).startswith("Endless"):
+        return "Some of these levels may begin as levels of the training do; --new-levels plays only others\n"
+    first = first_after(training) if config.start_level is None else config.start_level
+    count = count_trained_on(training, first, config.levels)
+    hint = "; --new-levels plays only others" if count else ""
+    return f"Of these {config.levels} levels, {count} begin as levels of the training do{hint}\n"
+
+
 def choose_metrics(wanted: tuple[str, ...], env_id: str, played: list[dict[str, np.ndarray]]) -> list[str]:
     """Return the metrics to report: those wanted, else the family's own, return, length and falls.
 
@@ -163,9 +181,7 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
         print(f"{title}\n\n{table(summaries)}\n")
         if finished < 1:
             print(f"--max-steps cut {1 - finished:.2%} of the episodes; what only their end tells is left out\n")
-        training = arguments[paths[0]]
-        if is_memory_gym(training["env_id"]) and training["num_levels"] and not config.new_levels:
-            print("Some of these levels may begin as levels of the training do; --new-levels plays only others\n")
+        print(trained_levels(arguments[paths[0]], config))
     if not report:
         raise ValueError(f"no task reports {', '.join(config.metrics)}")
     return report

@@ -45,7 +45,7 @@ def evaluation_levels(
     return [level for level in numbers for _ in range(repeats)]
 
 
-@functools.cache  # 100,000 levels take half a minute, and agents share them
+@functools.cache  # 100,000 levels take ten seconds, and agents share them
 def beginnings(env_id: str, env_options: str, first: int, count: int) -> tuple[bytes, ...]:
     """Return what so many levels from `first` on begin with: all that `oracle()` of the Memory Gym environments tells.
 
@@ -57,11 +57,21 @@ def beginnings(env_id: str, env_options: str, first: int, count: int) -> tuple[b
     found = []
     while len(found) < count:
         envs.reset(seed=[first + len(found) + lane for lane in range(AT_ONCE)])
-        told = [part.reshape(AT_ONCE, -1) for name, part in envs.unwrapped.oracle().items() if name != "seed"]
-        # Paths and sequences are as long as the longest of these; -1 follows their end.
-        found += [b"|".join(np.trim_zeros(part[lane] + 1, "b").tobytes() for part in told) for lane in range(AT_ONCE)]
+        told = [part.reshape(AT_ONCE, -1) + 1 for name, part in envs.unwrapped.oracle().items() if name != "seed"]
+        # Paths and sequences are as long as the longest of these; -1, now 0, follows their end.
+        found += [b"|".join(part[lane].tobytes().rstrip(b"\0") for part in told) for lane in range(AT_ONCE)]
     envs.close()
     return tuple(found[:count])
+
+
+def count_trained_on(args: RunArgs, first: int, levels: int) -> int:
+    """Return how many of so many levels from `first` on begin as one of the training's.
+
+    Raises ValueError as `beginnings` does.
+    """
+    task = args.env_id, args.env_options
+    trained_on = set(beginnings(*task, args.start_level, args.num_levels))
+    return sum(each in trained_on for each in beginnings(*task, first, levels))
 
 
 def new_levels(args: RunArgs, count: int, first: int) -> list[int]:

@@ -726,20 +726,32 @@ def test_other_levels(agents):
     assert ", 4 levels from 90 on that begin as none of the levels 5 to 14 does, " in new
 
 
+OTHERS = "; --new-levels plays only others\n"
+MAY = f"Some of these levels may begin as levels of the training do{OTHERS}"
+
+
 @pytest.mark.parametrize(
     ("env_id", "num_levels", "asked", "told"),
     [
-        ("MysteryPath-Grid-v0", 1000, {}, True),
-        ("MysteryPath-Grid-v0", 0, {}, False),
-        ("MysteryPath-Grid-v0", 10, {"new_levels": True}, False),
-        ("CartPole-v1", 10, {}, False),
+        ("MysteryPath-Grid-v0", 1000, {}, "Of these 40 levels, 7 begin as levels of the training do" + OTHERS),
+        ("MysteryPath-Grid-v0", 3, {}, "Of these 40 levels, 0 begin as levels of the training do\n"),
+        ("MysteryPath-Grid-v0", 3, {"start_level": 1}, "Of these 40 levels, 2 begin as levels of the training do"),
+        ("MysteryPath-Grid-v0", 1001, {}, MAY),
+        ("MysteryPath-Grid-v0", 10, {"env_options": '{"max_steps": 8}'}, MAY),
+        ("MysteryPath-Grid-v0", 0, {}, None),
+        ("MysteryPath-Grid-v0", 10, {"new_levels": True}, None),
+        ("Endless-MysteryPath-v0", 10, {}, MAY),
+        ("CartPole-v1", 10, {}, None),
     ],
 )
-def test_levels_may_begin_as_those_of_the_training(tiny, capsys, env_id, num_levels, asked, told):
+def test_how_many_levels_begin_as_those_of_the_training(tiny, capsys, monkeypatch, env_id, num_levels, asked, told):
+    monkeypatch.setattr(evaluate, "MOST_COUNTED", 1000)
     folder = ppo_gru.main(tiny(env_id=env_id, num_levels=num_levels, save_model=True, ground_truth_coef=0.0))
     capsys.readouterr()
-    evaluate.main(evaluate.Config((f"{folder}/model.pt",), levels=2, repeats=1, **asked))
-    assert ("--new-levels plays only others" in capsys.readouterr().out) == told
+    evaluate.main(evaluate.Config((f"{folder}/model.pt",), levels=40, repeats=1, max_steps=9, **asked))
+    printed = capsys.readouterr().out
+    assert (told or "") in printed
+    assert ("of the training do" in printed) == (told is not None)
 
 
 def test_reset_options_over_those_of_the_training(tiny):

@@ -77,6 +77,7 @@ def test_new_levels_begin_as_none_of_the_training_s(tiny):
     paths = [tuple(cells[1 : 1 + length]) for cells, length in zip(s.path_cell, s.path_length, strict=True)]
     wanted = [1007 + at for at in range(1500, 1800) if paths[at] not in set(paths[:1500])]
     assert 50 < len(wanted) < 250
+    assert evaluation.count_trained_on(args, 2507, 300) == 300 - len(wanted)
     assert evaluation.new_levels(args, len(wanted), 2507) == wanted
     assert evaluation_levels(args, 2, 3, new=True) == [wanted[0]] * 3 + [wanted[1]] * 3
 
