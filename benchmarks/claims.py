@@ -520,6 +520,7 @@ def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, V
             not_run.append(f"| {' | '.join([statement.text, statement.thesis, ', '.join(lacking)])} |")
             lacks += len(lacking) or 1
     counts = Counter(found.text for found in verdicts.values())
+    by_chance = ALPHA * (counts.total() - counts["not learned"])
     print(
         f"Of {shares.total()} statements tested, {shares['all']} hold in all their rows and {shares['some']} in some "
         f"({mixed} of which do not hold in others); "
@@ -528,7 +529,8 @@ def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, V
     print(
         f"Of {counts.total()} rows tested, {counts['holds']} hold and {counts['does not hold']} do not "
         f"({sum(stars.values())} of these {counts['holds'] + counts['does not hold']} with a star), "
-        f"{counts['not decided']} are not decided, {counts['not learned']} not learned. {lacks} more were not run."
+        f"{counts['not decided']} are not decided, {counts['not learned']} not learned. {lacks} more were not run. "
+        f"If no agents differed, at most {by_chance:.1f} of those tested would be decided, on average."
     )
     for table in (tested, not_run):
         if table[1:]:

@@ -247,7 +247,7 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     told = capsys.readouterr().out
     assert "trained" not in told
     assert f"\n| not run | thesis | `--claims` |\n|---|---|---|\n{start} | `normalized-gradients` |\n" in told
-    assert told.splitlines()[1].endswith(" 1 more were not run.")
+    assert " 1 more were not run. " in told.splitlines()[1]
 
 
 def test_unknown_claim():
@@ -321,7 +321,7 @@ def test_in_how_many_rows_statements_hold(monkeypatch, capsys):
         "Of 4 statements tested, 1 hold in all their rows and 1 in some (1 of which do not hold in others); of the "
         "others, 1 do not hold, 1 are not decided or not learned.",
         "Of 8 rows tested, 3 hold and 2 do not (2 of these 5 with a star), 2 are not decided, 1 not learned. 0 more "
-        "were not run.",
+        "were not run. If no agents differed, at most 0.4 of those tested would be decided, on average.",  # 0.05 x 7
     ]
 
 
@@ -335,4 +335,4 @@ def test_statements_without_runs_have_a_row(monkeypatch, capsys):
     assert rows[0].endswith("|  | `memory-MortarMayhem-Grid-v0`, `memory-MortarMayhem-v0` |")
     assert rows[-1].startswith("| 7.2 In BossFight,")
     count = len(claims.CLAIMS) + sum(not statement.claims for statement in claims.STATEMENTS)
-    assert rows_tested.endswith(f" {count} more were not run.")
+    assert f" {count} more were not run. " in rows_tested
