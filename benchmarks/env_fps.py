@@ -93,9 +93,8 @@ def measure(id_: str, original: type | None, lanes: tuple[int, int], seconds: fl
     one = gym.make(id_)
     tasks = [("one", single_rate, one), ("lanes", vector_rate, gym.make_vec(id_, num_envs=lanes[0]))]
     tasks.append(("reset", reset_rate, one))
-    if one.unwrapped.batch.variant.entries:
-        for name, num_envs in zip(("vectors", "many vectors"), lanes, strict=True):
-            tasks.append((name, vector_rate, gym.make_vec(id_, num_envs=num_envs, obs_type="vector")))
+    for name, num_envs in zip(("vectors", "many vectors"), lanes, strict=True):
+        tasks.append((name, vector_rate, gym.make_vec(id_, num_envs=num_envs, obs_type="vector")))
     if original:
         theirs = original()
         tasks[1:1] = [("their one", single_rate, theirs), ("their reset", reset_rate, theirs)]
@@ -163,8 +162,7 @@ def main() -> None:
         print(row(id_, found[id_]), flush=True)
     print(f"\nVector observations:\n\n{heading(VECTOR_COLUMNS, lanes)}")
     for id_, best in found.items():
-        if "vectors" in best:
-            print(line(f"`{id_}`", *cells(best, "their one", "vectors", "many vectors")))
+        print(line(f"`{id_}`", *cells(best, "their one", "vectors", "many vectors")))
 
 
 if __name__ == "__main__":
