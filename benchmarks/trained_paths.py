@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
@@ -37,6 +38,7 @@ COUNTED = {  # what the table calls them: id, reset options
     **{name: (task.env_id, json.dumps(task.options)) for name, task in TASKS.items() if task.best_score is not None},
     "quickstart": (ppo_gru.Args().env_id, ppo_gru.QUICKSTART["env_options"]),
 }
+ENDLESS, TILES = "Endless-MysteryPath-v0", (8, 11)  # tiles that a GRU comes to after 3 and 9 million steps
 EDGES = (0, 1, 2, 5, 11, 31, 101, np.inf)  # a column's levels: path so often in the training, below the next
 
 
@@ -57,10 +59,21 @@ def times_trained_on(args: RunArgs, levels: int) -> np.ndarray:
     return np.array([trained_on[each] for each in beginnings(*task, learning.FIRST_TEST_LEVEL, levels)])
 
 
+def first_tiles(first: int, levels: int, tiles: int) -> list[bytes]:
+    """Return the first tiles, after the origin, of so many levels of Endless Mystery Path."""
+    envs, found = gym.make_vec(ENDLESS, num_envs=TEST_LEVELS, obs_type="vector"), []
+    for level in range(first, first + levels, TEST_LEVELS):
+        envs.reset(seed=level)
+        found += [path[1 : tiles + 1].tobytes() for path in envs.unwrapped.oracle()["path"]]
+    envs.close()
+    return found
+
+
 def print_counts() -> None:
     """Print how many of each task's training levels differ, and how many test levels begin as none of them.
 
-    Which these are goes to benchmarks/new_levels.csv, a digit for each test level.
+    Of Endless Mystery Path only the first tiles count. Which levels of the others are new goes to
+    benchmarks/new_levels.csv, a digit for each.
     """
     lines = ["task,new"]
     print("| task | different levels of the first 100,000 | new of 1,000 test levels |\n|---|---:|---:|")
@@ -70,6 +83,10 @@ def print_counts() -> None:
         print(f"| {name} | {len(trained_on):,} | {sum(new):,} |")
         if name in TASKS and not all(new):
             lines.append(f"{name},{''.join(str(int(each)) for each in new)}")
+    for tiles in TILES:
+        trained_on = set(first_tiles(0, LEVELS, tiles))
+        new = [each not in trained_on for each in first_tiles(learning.FIRST_TEST_LEVEL, TEST_LEVELS, tiles)]
+        print(f"| {ENDLESS}, first {tiles} tiles | {len(trained_on):,} | {sum(new):,} |")
     tables.NEW_LEVELS.write_text("\n".join(lines) + "\n")
 
 

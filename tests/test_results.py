@@ -200,4 +200,18 @@ def test_counts_of_levels(monkeypatch, capsys, tmp_path):
     seen = set(evaluation.beginnings(*task, 0, 100))
     new = [each for each in evaluation.beginnings(*task, learning.FIRST_TEST_LEVEL, 50) if each not in seen]
     assert 0 < len(new) < 50
-    assert f"| quickstart | {len(seen)} | {len(new)} |" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert f"| quickstart | {len(seen)} | {len(new)} |" in told
+    assert f"| Endless-MysteryPath-v0, first 8 tiles | {endless_counts(8)} |" in told
+
+
+def endless_counts(tiles):
+    """Of levels 0 to 99: how many differ in the tiles that their paths begin with; of 50, how many begin otherwise."""
+    env = gym.make("Endless-MysteryPath-v0").unwrapped
+
+    def path(level):
+        env.reset(seed=level)
+        return tuple(map(tuple, env.oracle()["path"][1 : tiles + 1].tolist()))
+
+    seen = {path(level) for level in range(100)}
+    return f"{len(seen)} | {sum(path(learning.FIRST_TEST_LEVEL + level) not in seen for level in range(50))}"
