@@ -530,7 +530,7 @@ def main(config: Config) -> None:
     if not found:
         raise SystemExit(f"{config.results} has no results of these agents; without --report they are trained")
     bounds, thesis = tables.read_bounds(), tables.read_thesis()
-    for text in (tables.overview(found, bounds, thesis), tables.aggregate(found, bounds)):
+    for text in (tables.overview(found, bounds, thesis), tables.differing(found), tables.aggregate(found, bounds)):
         print(f"{text}\n" if text else "")
     for name, agents in found.items():
         print(f"## {TASKS[name].title}\n\n{tables.table(TASKS[name], agents)}\n")

@@ -169,6 +169,14 @@ class Comparison:
         return cls(difference / error, p_value, (difference - margin, difference + margin))
 
 
+def holm(p_values: list[float]) -> list[bool]:
+    """Return which of these p-values stand at a family-wise error of `ALPHA` (Holm, 1979)."""
+    order = np.argsort(p_values)
+    limits = ALPHA / np.arange(len(order), 0, -1)
+    passed = np.cumprod(np.array(p_values)[order] <= limits).astype(bool)  # from the smallest to the first that fails
+    return passed[np.argsort(order)].tolist()
+
+
 # ---- ONE TASK ----
 def table(task: Task, agents: Runs) -> str:
     """Return a task's table, a row for each agent that has runs, and below it what these took and on which machines."""
@@ -255,6 +263,22 @@ def overview(tasks: dict[str, Runs], bounds: dict[str, Bounds], thesis: dict[str
             " to ".join(dict.fromkeys(f"{each:.0f}" for each in (min(minutes), max(minutes)))),
         ]
         lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def differing(tasks: dict[str, Runs], rival: str = "GRU") -> str:
+    """Return a line for each agent: the tasks in which it differs from the rival, at a family-wise error of `ALPHA`."""
+    lines = []
+    for name in dict.fromkeys(agent for agents in tasks.values() for agent in agents if agent != rival):
+        p_values = {}
+        for task, agents in tasks.items():
+            if agents.get(name) and agents.get(rival):
+                ours, theirs = (final_scores(TASKS[task].score, agents[each]).mean(2) for each in (name, rival))
+                p_values[task] = Comparison.of(ours, theirs).p_value
+        found = [task for task, differs in zip(p_values, holm([*p_values.values()]), strict=True) if differs]
+        if len(p_values) > 1:
+            which = f"{name} and {rival} differ, with {len(p_values)} tasks tested at once (Holm, 1979), in "
+            lines.append(which + (", ".join(found) or "none"))
     return "\n".join(lines)
 
 

@@ -18,13 +18,15 @@ import claims
 import frontier
 import learning
 import ppo_gru
+import ppo_trxl
 import seeds
 import speedrun
 import tables
 import trained_paths
 import trials
 from memory_gym_envs.players import player
-from ppo_utils import evaluation, runs
+from ppo_utils import environments, evaluation, runs
+from ppo_utils.flags import check_args
 
 ROOT = Path(__file__).parents[1]
 
@@ -70,6 +72,18 @@ def test_every_number_of_the_results_is_printed_by_the_commands_beside_it(tmp_pa
     assert [score for score in scores if score not in printed] == []
     made, shown = (Image.open(each).size for each in (tmp_path / "paths.png", "docs/trained_paths.png"))
     assert made == shown
+
+
+def test_the_page_s_numbers_of_parameters():
+    counts = []
+    for script in (ppo_trxl, ppo_gru):
+        args = replace(script.Args(**script.PRESETS["laptop"]), env_id="MortarMayhem-Grid-v0")
+        check_args(args)
+        envs = environments.envs_for(args, 1)
+        agent = evaluation.make_agent(script.Agent, envs, envs.reset()[1], args)
+        counts.append(sum(parameter.numel() for parameter in agent.parameters()))
+    told = "TrXL+ has one block and {:,} parameters in Mortar Mayhem Grid, the GRU {:,}.".format(*counts)
+    assert told in (ROOT / "docs/results.md").read_text()
 
 
 def test_every_seed_is_a_dot(monkeypatch, tmp_path):

@@ -150,6 +150,27 @@ def test_all_tasks_together():
     ]
 
 
+def test_holm_by_hand():
+    """Of four at 5 %, the smallest has to be below 1.25 %, the next below 1.67 %, then 2.5 % and 5 %."""
+    assert tables.holm([0.04, 0.01, 0.03, 0.016]) == [False, True, False, True]
+    assert tables.holm([0.04, 0.01, 0.025, 0.016]) == [True] * 4
+    assert tables.holm([0.013, 0.9, 0.9, 0.9]) == [False] * 4
+    assert tables.holm([]) == []
+
+
+def test_in_which_tasks_agents_differ_with_all_tested_at_once():
+    """Of two, the p-values 0.001 and 0.03 are low enough, 0.03 and 0.04 are not."""
+    tasks, _ = two_tasks(gru=((0.6, 0.6), (5, 5)), none=((0.2, 0.2), (1, 1)))
+    begin = "no memory and GRU differ, with 2 tasks tested at once (Holm, 1979), in "
+    assert tables.differing(tasks) == f"{begin}SearingSpotlights-v0, Endless-SearingSpotlights-v0"
+    tasks, _ = two_tasks(gru=((0.6, 0.6), (5, 5)), none=((0.6, 0.6), (1, 1)))
+    assert tables.differing(tasks) == f"{begin}Endless-SearingSpotlights-v0"
+    tasks, _ = two_tasks(gru=((0.6, 0.5), (5, 6)), none=((0.3, 0.4), (4, 1)))
+    assert tables.differing(tasks) == f"{begin}none"
+    tasks["SearingSpotlights-v0"]["no memory"] = []
+    assert tables.differing(tasks) == "", "a single task needs no correction"
+
+
 def test_seeds_are_drawn_for_each_task_by_itself():
     """Both draw the worst of three seeds alone in less than 2.5 % of resamples; with one draw for both, in more."""
     tasks, bounds = two_tasks(gru=((1, 1, 1), (5, 5, 5)), none=((0.2, 0.6, 1), (1, 3, 5)))
