@@ -126,18 +126,20 @@ def title_of(args: dict[str, Any], config: Config) -> str:
 def trained_levels(args: dict[str, Any], config: Config) -> str:
     """Say how many of the levels that are played begin as one of the training's, where that can be known.
 
-    In an endless task, none has all of its beginning in common, but what an agent gets to see of it may be.
+    In an endless task it is not counted: an agent sees only as much of a level as it comes to.
     """
     training = SimpleNamespace(**args)
     if not is_memory_gym(training.env_id) or not training.num_levels or config.new_levels:
         return ""
-    few = training.num_levels <= MOST_COUNTED and config.env_options is None
-    if not few or bare_id(training.env_id).startswith("Endless"):
-        return "Some of these levels may begin as levels of the training do; --new-levels plays only others\n"
+    may, hint = "Some of these levels may begin as levels of the training do", "; --new-levels plays only others"
+    if bare_id(training.env_id).startswith("Endless") or config.env_options is not None:
+        return may
+    if training.num_levels > MOST_COUNTED:
+        return may + hint
     first = first_after(training) if config.start_level is None else config.start_level
     count = count_trained_on(training, first, config.levels)
-    hint = "; --new-levels plays only others" if count else ""
-    return f"Of these {config.levels} levels, {count} begin as levels of the training do{hint}\n"
+    told = f"Of these {config.levels} levels, {count} begin as levels of the training do"
+    return told + hint if 0 < count < config.levels else told
 
 
 def choose_metrics(wanted: tuple[str, ...], env_id: str, played: list[dict[str, np.ndarray]]) -> list[str]:
@@ -181,7 +183,11 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
         print(f"{title}\n\n{table(summaries)}\n")
         if finished < 1:
             print(f"--max-steps cut {1 - finished:.2%} of the episodes; what only their end tells is left out\n")
-        print(trained_levels(arguments[paths[0]], config))
+        trainings = {(arguments[path]["start_level"], arguments[path]["num_levels"]): arguments[path] for path in paths}
+        for (first, count), training in trainings.items():
+            if told := trained_levels(training, config):
+                whose = f"Trained on {count} levels from {first} on: " if len(trainings) > 1 else ""
+                print(f"{whose}{told}\n")
     if not report:
         raise ValueError(f"no task reports {', '.join(config.metrics)}")
     return report

@@ -333,7 +333,7 @@ def write_result(config: Training, plan: Plan) -> None:
 def write_run(run: RunLog, path: str) -> None:
     """Write what tables and pictures need, in a few KB; `read_run` reads it as it reads the run's folder.
 
-    That is the machine, the commit, the arguments, the evaluations in the family's own metric, return, length and
+    That is the machine, the commit now, the arguments, the evaluations in the family's own metric, return, length and
     falls, those on test levels too, the seconds of each iteration, and the curves UPDATE_CURVES, averaged to POINTS.
     Steps are kept as differences, which compress better.
     """
@@ -387,7 +387,7 @@ def machine() -> str:
 
 
 def commit() -> str:
-    """Name the commit of this code, with "-dirty" where it has been changed; empty outside of a git repository."""
+    """Name the commit of the code that writes a result, "-dirty" where that was changed; empty without a repository."""
     line = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
     try:
         return subprocess.run(line, capture_output=True, text=True, check=True).stdout.strip()

@@ -100,13 +100,15 @@ STEPS = {ppo_gru.Agent: RecurrentStep, ppo_trxl.Agent: TransformerStep}
 
 
 def main(config: Config) -> None:
-    """Write the program; raise ValueError for an agent of another script, OSError, and what `Player` raises."""
+    """Write the program; raise ValueError for an agent of another script, and what `Player` raises."""
+    out = Path(config.out)
+    if out.is_dir() or not out.parent.is_dir():
+        raise ValueError(f"--out is {config.out}; give a file in a folder that is there")
     player = Player(config.checkpoint)
     kind = STEPS.get(type(player.agent))
     if kind is None:
         raise ValueError("only agents of ppo_gru.py and ppo_trxl.py can be exported; write a step like theirs here")
     step = kind(player.agent).eval()
-    Path(config.out).touch()  # before the work, where it cannot be written
     obs = {name: torch.from_numpy(part) for name, part in player.envs.observation_space.sample().items()}
     torch.export.save(torch.export.export(step, (obs, *step.beginning())), config.out)
     print(f"wrote {config.out}")

@@ -339,7 +339,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
 
     def get_state(self) -> dict[str, Any]:
         """The lanes' arrays, options, seeds and generators, in plain values that later steps do not change."""
-        made_with = {**self.arguments, "options": self.defaults}
+        made_with = {**self.arguments, "options": plain(self.defaults)}
         return {**super().get_state(), "made_with": made_with, "arrays": plain(vars(self.state))}
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -364,11 +364,11 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
     def _check_state(self, state: dict[str, Any]) -> None:
         """Raises ValueError if the state is of one made with other arguments, or has not what every lane needs."""
         ours, theirs = {**self.arguments, "options": self.defaults}, {**state["made_with"]}
-        theirs["options"] = self.complete_options(theirs.get("options"))  # which earlier versions did not save
-        for name in ours | theirs:
-            if theirs.get(name) != ours.get(name):
-                given, wanted = (brief(each.get(name)) for each in (theirs, ours))
-                raise ValueError(f"the saved state is of one with {name} {given}, not {wanted}")
+        options = theirs.pop("options", None)  # which earlier versions did not save
+        for name in self.arguments | theirs | {"options": None}:  # last, since another id has others
+            given = self.complete_options(options) if name == "options" else theirs.get(name)
+            if given != ours.get(name):
+                raise ValueError(f"the saved state is of one with {name} {brief(given)}, not {brief(ours.get(name))}")
         for name in self.kept:
             given, ours = state[name], plain(getattr(self, name))
             if type(given) is not type(ours) or getattr(given, "dtype", None) != getattr(ours, "dtype", None):

@@ -57,9 +57,8 @@ def beginnings(env_id: str, env_options: str, first: int, count: int) -> tuple[b
     found = []
     while len(found) < count:
         envs.reset(seed=[first + len(found) + lane for lane in range(AT_ONCE)])
-        told = [part.reshape(AT_ONCE, -1) + 1 for name, part in envs.unwrapped.oracle().items() if name != "seed"]
-        # Paths and sequences are as long as the longest of these; -1, now 0, follows their end.
-        found += [b"|".join(part[lane].tobytes().rstrip(b"\0") for part in told) for lane in range(AT_ONCE)]
+        told = [part for name, part in envs.unwrapped.oracle().items() if name != "seed"]  # as wide for all levels
+        found += [b"|".join(part[lane].tobytes() for part in told) for lane in range(AT_ONCE)]
     envs.close()
     return tuple(found[:count])
 

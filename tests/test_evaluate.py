@@ -727,7 +727,7 @@ def test_other_levels(agents):
 
 
 OTHERS = "; --new-levels plays only others\n"
-MAY = f"Some of these levels may begin as levels of the training do{OTHERS}"
+MAY = "Some of these levels may begin as levels of the training do"
 
 
 @pytest.mark.parametrize(
@@ -736,11 +736,12 @@ MAY = f"Some of these levels may begin as levels of the training do{OTHERS}"
         ("MysteryPath-Grid-v0", 1000, {}, "Of these 40 levels, 7 begin as levels of the training do" + OTHERS),
         ("MysteryPath-Grid-v0", 3, {}, "Of these 40 levels, 0 begin as levels of the training do\n"),
         ("MysteryPath-Grid-v0", 3, {"start_level": 1}, "Of these 40 levels, 2 begin as levels of the training do"),
-        ("MysteryPath-Grid-v0", 1001, {}, MAY),
-        ("MysteryPath-Grid-v0", 10, {"env_options": '{"max_steps": 8}'}, MAY),
+        ("MysteryPath-Grid-v0", 999, {"start_level": 9}, "Of these 40 levels, 40 begin as levels of the training do\n"),
+        ("MysteryPath-Grid-v0", 1001, {}, MAY + OTHERS),
+        ("MysteryPath-Grid-v0", 10, {"env_options": '{"max_steps": 8}'}, f"{MAY}\n"),
         ("MysteryPath-Grid-v0", 0, {}, None),
         ("MysteryPath-Grid-v0", 10, {"new_levels": True}, None),
-        ("Endless-MysteryPath-v0", 10, {}, MAY),
+        ("Endless-MysteryPath-v0", 10, {}, f"{MAY}\n"),
         ("CartPole-v1", 10, {}, None),
     ],
 )
@@ -752,6 +753,22 @@ def test_how_many_levels_begin_as_those_of_the_training(tiny, capsys, monkeypatc
     printed = capsys.readouterr().out
     assert (told or "") in printed
     assert ("of the training do" in printed) == (told is not None)
+
+
+def test_levels_are_counted_for_each_training(tiny, capsys):
+    """Two agents, with other training levels, that play the same ones."""
+    models = []
+    for number, seed in ((3, 1), (1000, 2)):
+        args = tiny(env_id="MysteryPath-Grid-v0", num_levels=number, seed=seed, save_model=True)
+        models.append(f"{ppo_gru.main(args)}/model.pt")
+    capsys.readouterr()
+    evaluate.main(evaluate.Config(tuple(models), start_level=1000, levels=40, repeats=1, max_steps=9))
+    assert capsys.readouterr().out.splitlines()[-4:] == [
+        "Trained on 3 levels from 0 on: Of these 40 levels, 0 begin as levels of the training do",
+        "",
+        f"Trained on 1000 levels from 0 on: Of these 40 levels, 7 begin as levels of the training do{OTHERS.strip()}",
+        "",
+    ]
 
 
 def test_reset_options_over_those_of_the_training(tiny):

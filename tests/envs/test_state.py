@@ -121,6 +121,7 @@ def play_on(env, actions):
     ("other", "message"),
     [
         ({"id": "MysteryPath-Grid-v0"}, "of one with id 'MysteryPath-Grid-v0', not 'MysteryPath-v0'"),
+        ({"id": "MortarMayhem-v0"}, "of one with id 'MortarMayhem-v0', not 'MysteryPath-v0'"),  # it has other options
         ({"obs_type": "vector"}, "the saved state is of one with obs_type 'vector', not 'pixels'"),
         ({"num_levels": 4}, "the saved state is of one with num_levels 4, not 0"),
         ({"options": {"max_steps": 9}}, "the saved state is of one with options {'max_steps': 9, "),
@@ -224,6 +225,21 @@ def test_generators_that_are_none(name, wrong, message):
     state = env.get_state()
     state["batch"][name][0] = wrong
     check_refused(env, state, message)
+
+
+def test_options_of_the_state_of_another_version():
+    """It may have saved none, or not all of them."""
+    envs = gym.make_vec("MysteryPath-v0", num_envs=2)
+    envs.reset(seed=0)
+    state = envs.get_state()
+    before = pickle.dumps(state)
+    for made_with in ({"options": {}}, {"options": {"max_steps": 512}}):
+        envs.set_state({**state, "made_with": {**state["made_with"], **made_with}})
+    state["made_with"].pop("options")
+    envs.set_state(state)
+    assert pickle.dumps(envs.get_state()) == before
+    envs.get_state()["made_with"]["options"]["max_steps"] = 3  # the caller's own
+    assert pickle.dumps(envs.get_state()) == before
 
 
 def test_what_is_no_state():
