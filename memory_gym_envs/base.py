@@ -363,12 +363,14 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
 
     def _check_state(self, state: dict[str, Any]) -> None:
         """Raises ValueError if the state is of one made with other arguments, or has not what every lane needs."""
-        ours, theirs = {**self.arguments, "options": self.defaults}, {**state["made_with"]}
+        ours, theirs = {**self.arguments}, {**state["made_with"]}
         options = theirs.pop("options", None)  # which earlier versions did not save
-        for name in self.arguments | theirs | {"options": None}:  # last, since another id has others
-            given = self.complete_options(options) if name == "options" else theirs.get(name)
-            if given != ours.get(name):
-                raise ValueError(f"the saved state is of one with {name} {brief(given)}, not {brief(ours.get(name))}")
+        for name in ours | theirs:
+            if theirs.get(name) != ours.get(name):
+                given, wanted = (brief(each.get(name)) for each in (theirs, ours))
+                raise ValueError(f"the saved state is of one with {name} {given}, not {wanted}")
+        if (completed := self.complete_options(options)) != self.defaults:  # last: another id has others
+            raise ValueError(f"the saved state is of one with options {brief(completed)}, not {brief(self.defaults)}")
         for name in self.kept:
             given, ours = state[name], plain(getattr(self, name))
             if type(given) is not type(ours) or getattr(given, "dtype", None) != getattr(ours, "dtype", None):
