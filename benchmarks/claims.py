@@ -409,7 +409,7 @@ class Verdict:
     text: str
     p_value: float = 1.0
     interval: tuple[float, float] | None = None  # of the difference of A and B, if there is one
-    left: tuple[str, ...] = ()  # where only some pairs are decided, who else, alone if it is with all of B
+    left: tuple[str, ...] = ()  # who is not ahead of all of B, where some pairs are decided
 
     def __str__(self) -> str:
         if self.interval:
@@ -536,7 +536,7 @@ def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, V
             not_run.append(f"| {' | '.join([statement.text, statement.thesis, ', '.join(lacking)])} |")
             lacks += len(lacking) or 1
     counts = Counter(found.text for found in verdicts.values())
-    # That one is `times` as high as another is no matter of chance.
+    # Equal agents would decide a claim about `times` as high for certain, not by chance.
     by_chance = ALPHA * sum(each.text != "not learned" and CLAIMS[name].times == 1 for name, each in verdicts.items())
     print(
         f"Of {shares.total()} statements tested, {shares['all']} hold in all their rows and {shares['some']} in some "

@@ -137,7 +137,7 @@ class Comparison:
 
     errors: float
     p_value: float  # two-sided
-    interval: tuple[float, float] | None = None  # of the difference, 1 - ALPHA; None for a single seed
+    interval: tuple[float, float] | None = None  # of the difference, of confidence 1 - ALPHA; None: one seed
 
     @property
     def is_ahead(self) -> bool:
