@@ -196,7 +196,7 @@ STATEMENTS = (
     ),
     Statement(
         "6.2.3 LSTM needs more samples than GRU elsewhere, in Mystery Path than TrXL, too",
-        "full success in Mystery Path",
+        "slightly more in Searing Spotlights; full success in Mystery Path",
         claims_of("lstm-samples", "SearingSpotlights-v0", GRU, ("LSTM",), measure=area)
         | claims_of("lstm-samples", "MysteryPath-Grid-v0", MEMORY, ("LSTM",), measure=area),
     ),
@@ -233,19 +233,27 @@ STATEMENTS = (
         "6.3 After 819 M steps, GRU still learns in Endless Searing Spotlights, both in Endless Mystery Path",
         "",
     ),
+    Statement(
+        "6.3 In Endless Mystery Path, agents fall off after much progress ([how episodes end](results.md#for-longer))",
+        "",
+    ),
     Statement("6.3 TrXL is worse with reconstruction in Endless Mortar Mayhem", "18, with it 10 commands"),
     Statement(
         "6.4 An iteration of GRU takes less time ([speeds here](running.md#speed))",
         "on an A100, Endless Mortar Mayhem 4.11, 5.53 s; Mystery Path 5.19, 7.39 s",
     ),
-    Statement("6.4 In Mystery Path, an iteration of GTrXL takes less time than of TrXL", "table 6.4"),
+    Statement(
+        "6.4 In Mystery Path, an iteration of GTrXL takes less time than of TrXL, since it resets less often",
+        "table 6.4",
+    ),
     Statement(
         "6.4 In equal time, GRU is ahead in endless tasks, and as good as TrXL in Mystery Path",
         "a training of 57, 77 hours; figure 6.4",
     ),
     Statement("6.4 Compiled, an iteration of TrXL takes less time", "compiled 5.53, else 7.97 s"),
     Statement(
-        "6.4 Reconstruction and ground truth add little time, HELM much", "76, 80, 81 hours; 5 times as long as GRU"
+        "6.4 Reconstruction and ground truth add little time, HELM much",
+        "76, 80, 81 hours (the last with final rate and query); at least 5 times as long as GRU",
     ),
     Statement(
         "6.5.1 TrXL's blocks attend to different steps ([one block here](results.md#what-the-transformer-attends-to))",
@@ -316,7 +324,7 @@ STATEMENTS = (
     ),
     Statement("7.1.3 The previous output of the last block in the query harms", '"catastrophic"'),
     Statement(
-        "7.1.4 Refreshed memory may help TrXL",
+        "7.1.4 Stale memory may harm TrXL (refreshed here: [the rollout's](memory.md))",
         "not tested",
         {"stale": in_endless(("TrXL --refresh-memory",), TRXL)},
     ),
@@ -383,14 +391,18 @@ STATEMENTS = (
         "advantages, they do not",
         "figure 7.4",
     ),
-    Statement("7.3.1 In Searing Spotlights, optimal agents are too fast for spotlights to matter", "33 steps"),
+    Statement(
+        "7.3.1 In Searing Spotlights, optimal agents are too fast for spotlights to matter (also 6.5.3; [fewest "
+        "steps](environments.md#differences-from-memory-gym-102))",
+        "33 steps",
+    ),
 )
 CLAIMS = {name: claim for statement in STATEMENTS for name, claim in statement.claims.items()}
 HEADING = """
 | statement | thesis | A | B | M steps | verdict | `--claims` |
 |---|---|---|---|---:|---|---|"""
-NOT_RUN = """
-| not run | thesis | `--claims` |
+NOT_TESTED = """
+| not tested | thesis | `--claims` |
 |---|---|---|"""
 
 
@@ -519,7 +531,7 @@ def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, V
     runs: of each claim that was asked for, by its agents.
     """
     stars = dict(zip(verdicts, tables.holm([each.p_value for each in verdicts.values()]), strict=True))
-    tested, not_run, shares, mixed, lacks = [HEADING], [NOT_RUN], Counter(), 0, 0
+    tested, rest, shares, mixed, lacks = [HEADING], [NOT_TESTED], Counter(), 0, 0
     for statement in STATEMENTS:
         said = statement.text, statement.thesis  # once, above rows that say the same of other tasks
         names = [name for name in statement.claims if name in verdicts]
@@ -533,24 +545,24 @@ def print_tables(runs: dict[str, dict[str, list[RunLog]]], verdicts: dict[str, V
         lacking = [f"`{name}`" for name in statement.claims if name in runs and name not in verdicts]
         # What no claim was made of has a row all the same, unless only some claims were asked for.
         if lacking or (not statement.claims and runs.keys() == CLAIMS.keys()):
-            not_run.append(f"| {' | '.join([statement.text, statement.thesis, ', '.join(lacking)])} |")
+            rest.append(f"| {' | '.join([statement.text, statement.thesis, ', '.join(lacking)])} |")
             lacks += len(lacking) or 1
     counts = Counter(found.text for found in verdicts.values())
     # Equal agents would decide a claim about `times` as high for certain, not by chance.
     by_chance = ALPHA * sum(each.text != "not learned" and CLAIMS[name].times == 1 for name, each in verdicts.items())
     print(
-        f"Of {shares.total()} statements tested, {shares['all']} hold in all their rows and {shares['some']} in some "
+        f"Of {shares.total()} statements tested, {shares['all']} hold in all rows and {shares['some']} in some "
         f"({mixed} of which do not hold in others); "
         f"of the others, {shares['none']} do not hold, {shares['open']} are not decided or not learned."
     )
     print(
         f"Of {counts.total()} rows tested, {counts['holds']} hold and {counts['does not hold']} do not "
         f"({sum(stars.values())} of these {counts['holds'] + counts['does not hold']} with a star), "
-        f"{counts['not decided']} are not decided, {counts['not learned']} not learned. {lacks} more were not run. "
-        f"By chance alone, at most about {by_chance:.0f} of those tested would be decided: any without a star may be "
-        "one of them."
+        f"{counts['not decided']} are not decided, {counts['not learned']} not learned. {lacks} more were not tested. "
+        f"If no agents differed, {by_chance:.1f} of those tested would be decided on average, at most: any without a "
+        "star may be one of them."
     )
-    for table in (tested, not_run):
+    for table in (tested, rest):
         if table[1:]:
             print("\n".join(table))
 

@@ -28,6 +28,7 @@ BOUNDS, THESIS, NEW_LEVELS = (Path(__file__).with_name(f"{name}.csv") for name i
 ALPHA = 0.05  # significance level: agents differ if the p-value is below it
 SHOWN = ("show_origin", "show_goal")  # options that change how a level looks, not what it is
 RIVALS = ("no memory", "GRU")  # with which the others are compared over all tasks
+DIFFER_FROM = ("GRU", "16 frames")  # with which they are compared with all tasks tested at once
 NAMES_APART = 0.075  # between the names beside the curves' ends, as a share of the axis
 
 
@@ -266,10 +267,12 @@ def overview(tasks: dict[str, Runs], bounds: dict[str, Bounds], thesis: dict[str
     return "\n".join(lines)
 
 
-def differing(tasks: dict[str, Runs], rival: str = "GRU") -> str:
-    """Return a line for each agent: the tasks in which it differs from the rival, at a family-wise error of `ALPHA`."""
-    lines = []
-    for name in dict.fromkeys(agent for agents in tasks.values() for agent in agents if agent != rival):
+def differing(tasks: dict[str, Runs]) -> str:
+    """Return a line for each agent and each of DIFFER_FROM: where they differ, at a family-wise error of `ALPHA`."""
+    names, lines = dict.fromkeys(agent for agents in tasks.values() for agent in agents), []
+    for rival, name in itertools.product(DIFFER_FROM, names):
+        if name == rival or name in DIFFER_FROM[: DIFFER_FROM.index(rival)]:  # which has that line
+            continue
         p_values = {}
         for task, agents in tasks.items():
             if agents.get(name) and agents.get(rival):

@@ -248,8 +248,8 @@ def test_a_claim_from_training_to_its_row(tmp_path, monkeypatch, capsys):
     claims.main(replace(config, report=True, seeds=(1, 2, 3)))
     told = capsys.readouterr().out
     assert "trained" not in told
-    assert f"\n| not run | thesis | `--claims` |\n|---|---|---|\n{start} | `normalized-gradients` |\n" in told
-    assert " 1 more were not run. " in told.splitlines()[1]
+    assert f"\n| not tested | thesis | `--claims` |\n|---|---|---|\n{start} | `normalized-gradients` |\n" in told
+    assert " 1 more were not tested. " in told.splitlines()[1]
 
 
 def test_unknown_claim():
@@ -260,10 +260,10 @@ def test_unknown_claim():
 @pytest.mark.parametrize(
     ("claim", "seeds", "counts"),
     [
-        ("query-position-gru", (1, 2, 3), "0 are not decided, 1 not learned. 0 more were not run."),
-        ("query-position-gru", (1, 2), "0 are not decided, 0 not learned. 1 more were not run."),
-        ("memory-flat-list", (1, 2, 3), "0 are not decided, 1 not learned. 0 more were not run."),
-        ("normalized-no-memory", (), "1 are not decided, 0 not learned. 0 more were not run."),
+        ("query-position-gru", (1, 2, 3), "0 are not decided, 1 not learned. 0 more were not tested."),
+        ("query-position-gru", (1, 2), "0 are not decided, 0 not learned. 1 more were not tested."),
+        ("memory-flat-list", (1, 2, 3), "0 are not decided, 1 not learned. 0 more were not tested."),
+        ("normalized-no-memory", (), "1 are not decided, 0 not learned. 0 more were not tested."),
     ],
 )
 def test_what_is_learned_is_judged_by_all_runs_without_memory(monkeypatch, capsys, claim, seeds, counts):
@@ -320,19 +320,19 @@ def test_in_how_many_rows_statements_hold(monkeypatch, capsys):
     monkeypatch.setattr(claims, "judge", lambda claim, *_: found[id(claim)])
     claims.main(claims.Config(claims=tuple(verdicts), report=True))
     assert capsys.readouterr().out.splitlines()[:2] == [
-        "Of 4 statements tested, 1 hold in all their rows and 1 in some (1 of which do not hold in others); of the "
+        "Of 4 statements tested, 1 hold in all rows and 1 in some (1 of which do not hold in others); of the "
         "others, 1 do not hold, 1 are not decided or not learned.",
         "Of 8 rows tested, 3 hold and 2 do not (2 of these 5 with a star), 2 are not decided, 1 not learned. 0 more "
-        "were not run. By chance alone, at most about 0 of those tested would be decided: any without a star "
-        "may be one of them.",
+        "were not tested. If no agents differed, 0.4 of those tested would be decided on average, at most: any "
+        "without a star may be one of them.",
     ]
 
 
 @pytest.mark.parametrize(
-    ("text", "rows", "expected"), [("not decided", 29, 1), ("not decided", 30, 2), ("not learned", 30, 0)]
+    ("text", "rows", "expected"), [("not decided", 20, 1.0), ("not decided", 30, 1.5), ("not learned", 30, 0.0)]
 )
 def test_how_many_rows_would_be_decided_by_chance(monkeypatch, capsys, text, rows, expected):
-    """A twentieth of those that were learned, 1.45 of 29; not of one about how many times as high a number is."""
+    """A twentieth of those that were learned; not of one about how many times as high a number is."""
     curve = np.array([100]), np.full((1, 4, 1), 0.5)
     scores = {f"eval/{name}": curve for name in ("success", "carried_out", "num_fails", "return", "length")}
     scores |= {"eval/coins_collected": curve, "losses/grad_norm": curve}
@@ -341,17 +341,17 @@ def test_how_many_rows_would_be_decided_by_chance(monkeypatch, capsys, text, row
     monkeypatch.setattr(claims, "judge", lambda *_: claims.Verdict(text))
     names = [name for name, claim in claims.CLAIMS.items() if claim.times == 1][:rows]
     claims.main(claims.Config(claims=(*names, "normalized-gradients"), report=True))
-    assert f" By chance alone, at most about {expected} of those tested " in capsys.readouterr().out
+    assert f" If no agents differed, {expected} of those tested " in capsys.readouterr().out
 
 
 def test_statements_without_runs_have_a_row(monkeypatch, capsys):
     monkeypatch.setattr(learning, "result_of", lambda config, plan: None)
     claims.main(claims.Config(report=True))
     statements, rows_tested, _, head, _, *rows = capsys.readouterr().out.splitlines()
-    assert head == "| not run | thesis | `--claims` |"
+    assert head == "| not tested | thesis | `--claims` |"
     assert len(rows) == len(claims.STATEMENTS)
-    assert statements.startswith("Of 0 statements tested, 0 hold in all their rows and 0 in some (0 of which ")
+    assert statements.startswith("Of 0 statements tested, 0 hold in all rows and 0 in some (0 of which ")
     assert rows[0].endswith("|  | `memory-MortarMayhem-Grid-v0`, `memory-MortarMayhem-v0` |")
     assert rows[-1].startswith("| 7.3.1 In Searing Spotlights,")
     count = len(claims.CLAIMS) + sum(not statement.claims for statement in claims.STATEMENTS)
-    assert f" {count} more were not run. " in rows_tested
+    assert f" {count} more were not tested. " in rows_tested

@@ -136,7 +136,7 @@ def test_every_number_of_the_page_of_tuning_is_printed(tmp_path, monkeypatch, ca
     assert numbers <= set(re.findall(r"\d+\.\d+", printed))
 
 
-def test_the_table_of_the_fastest_is_printed_by_its_command(capsys):
+def test_the_table_of_fewest_steps_is_printed_by_its_command(capsys):
     speedrun.main()
     assert capsys.readouterr().out in (ROOT / "docs/results.md").read_text()
 

@@ -175,6 +175,15 @@ def test_in_which_tasks_agents_differ_with_all_tested_at_once(monkeypatch, p_val
     assert tables.differing(tasks) == f"no memory and GRU differ, with 2 tasks tested at once (Holm, 1979), in {differ}"
 
 
+def test_two_agents_have_one_line(monkeypatch):
+    tasks, _ = two_tasks(gru=((0.6, 0.6), (5, 5)), none=((0.2, 0.2), (1, 1)))
+    for agents in tasks.values():
+        agents["16 frames"] = agents["GRU"]
+    lines = tables.differing(tasks).splitlines()
+    pairs = ["no memory and GRU", "16 frames and GRU", "no memory and 16 frames"]
+    assert [line.partition(" differ, ")[0] for line in lines] == pairs
+
+
 def test_one_task_needs_no_correction():
     tasks, _ = two_tasks(gru=((0.6, 0.6), (5, 5)), none=((0.2, 0.2), (1, 1)))
     tasks["SearingSpotlights-v0"]["no memory"] = []
@@ -276,22 +285,22 @@ ENTRY = 'task,target,agent,steps,date,commit\nSearingSpotlights-v0,0.9,"GRU",6e6
 
 @pytest.fixture
 def entry(tmp_path, monkeypatch):
-    """Return a function that makes an entry's row, from the mean score of each seed."""
+    """Return a function that makes an entry's row, from the mean score of each seed; further lines may follow it."""
 
-    def row(*means):
+    def row(*means, lines=""):
         runs = [run_with(0, 0, mean, metric="test/success") for mean in means]
         results = {"SearingSpotlights-v0": {"GRU": runs}}
         monkeypatch.setattr(learning, "results_of", lambda config, plans: results)
-        (tmp_path / "speedrun.csv").write_text(ENTRY)
+        (tmp_path / "speedrun.csv").write_text(ENTRY + lines)
         monkeypatch.setattr(speedrun, "ENTRIES", tmp_path / "speedrun.csv")
         speedrun.main()
 
     return row
 
 
-def test_an_entry_has_its_score_and_minutes(entry, capsys):
+def test_an_entry_has_its_score(entry, capsys):
     entry(0.95, 0.94, 0.96, 0.95, 0.95)
-    row = "| SearingSpotlights-v0 | 0.9 | `GRU` | 0.95 ± 0.00 | 0.0001 | 6 M | 3.0 | 2026-11-29, abc1234 |"
+    row = "| SearingSpotlights-v0 | 0.9 | `GRU` | 0.95 ± 0.00 | 0.0001 | 6 M | 2026-11-29, abc1234 |"
     assert capsys.readouterr().out.splitlines()[-1] == row
 
 
@@ -308,6 +317,14 @@ def test_an_entry_has_its_score_and_minutes(entry, capsys):
 def test_what_is_no_entry(entry, means, message):
     with pytest.raises(SystemExit, match=message):
         entry(*means)
+
+
+@pytest.mark.parametrize("steps", ["6e6", "7e6"])
+def test_a_later_entry_needs_fewer_steps(entry, steps):
+    """Of one task."""
+    lines = f"MortarMayhem-Grid-v0,0.9,GRU,3e6,,\nSearingSpotlights-v0,0.9,TrXL+,{steps},,\n"
+    with pytest.raises(SystemExit, match=r"TrXL\+ in SearingSpotlights-v0 has .,000,000 steps; .* than 6,000,000"):
+        entry(lines=lines)
 
 
 def test_a_mean_above_the_target():
