@@ -7,24 +7,26 @@ with 1 if there is a fault. Agents of other packages: docs/check_your_memory.md.
 """
 
 import argparse
+import importlib
 import re
 import sys
 from pathlib import Path
 
 import torch
 
-from ppo_utils.checkpoints import SCRIPT_NAME, import_script
+from ppo_utils.checkpoints import SCRIPT_NAME
+from ppo_utils.errors import RunError
 from ppo_utils.flags import check_bounds
 from ppo_utils.memory_adapters import ScriptAdapter
 from ppo_utils.memory_check import check
-from ppo_utils.runs import parse_args
+from ppo_utils.runs import parse_args, report_out_of_memory
 from ppo_utils.terminal import one_line_exit, open_streams
 
 
 def main() -> int:
     """Check what the command line says.
 
-    Raises ValueError, OSError or ImportError for a script or flags that make no agent.
+    Raises ValueError, OSError, ImportError or RunError for a script or flags that make no agent.
     """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("script", help="a script, ppo_NAME.py")
@@ -36,16 +38,19 @@ def main() -> int:
     if not re.fullmatch(SCRIPT_NAME, path.stem):
         raise ValueError(f"the script {given.script} must be named ppo_NAME.py")
     sys.path.insert(0, str(path.parent))  # before this folder, which may have a script of the same name
-    script = import_script({"script": path.stem}, given.script)
+    script = importlib.import_module(path.stem)
+    if lacks := [name for name in ("Args", "Agent") if not hasattr(script, name)]:
+        raise ValueError(f"the script {given.script} has no {lacks[0]}; give one such as ppo_gru.py")
     args = parse_args(script.Args, getattr(script, "PRESETS", {}), given.flags)
     check_bounds(args)
     torch.manual_seed(args.seed)
-    report = check(ScriptAdapter(script, args))
+    with report_out_of_memory(args, torch.device("cpu")):
+        report = check(ScriptAdapter(script, args))
     print(report)
     return bool(report.failed)
 
 
 if __name__ == "__main__":
     open_streams()
-    with one_line_exit(ValueError, OSError, ImportError):
+    with one_line_exit(ValueError, OSError, ImportError, RunError):
         sys.exit(main())

@@ -30,7 +30,7 @@ from torch import Tensor, nn
 
 from ppo_utils.checkpoints import Checkpoint
 from ppo_utils.environments import as_tensors, envs_for, is_memory_gym, wrappers_of
-from ppo_utils.errors import RunError
+from ppo_utils.errors import RunError, report_unusable_policy
 from ppo_utils.evaluation import MEMORY_STEPS, first_after, with_room
 from ppo_utils.flags import bounded, check_bounds
 from ppo_utils.infos import final_numbers, ground_truths
@@ -100,7 +100,7 @@ class Config:
     levels: bounded(int, 1, 100) = 1
     """levels to play, from this one on"""
     deterministic: bool = False
-    """take the most probable actions instead of drawing them"""
+    """take the most probable actions instead of sampling them"""
     env_options: str | None = None
     """reset options of a Memory Gym environment as JSON, over those of the training"""
     out: str = "page.html"
@@ -172,7 +172,8 @@ def play(
     """Play one episode, or max_steps of it, in the only lane of `envs`, with an empty memory.
 
     deterministic: take the most probable actions. stacked: whether the images that the agent gets are stacks of
-    grayscale ones. Raises ValueError if there are no images, and RunError as the environment does.
+    grayscale ones. Raises ValueError if there are no images, RunError as the environment does and if the policy is not
+    finite.
     """
     torch.manual_seed(seed)
     family = family_of(envs.spec.id)
@@ -192,7 +193,7 @@ def play(
         memory = with_room(agent.memory, memory, step)
         if family and family.shows(envs.unwrapped.state):
             episode.events[family.shown].append(step)
-        with watching(agent, memory, episode):
+        with watching(agent, memory, episode), report_unusable_policy():
             now = as_tensors(obs, torch.device("cpu"))
             actions, *_ = agent.get_action_and_value(now, memory, deterministic)
         episode.actions.append(actions[0].tolist())

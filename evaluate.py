@@ -67,7 +67,7 @@ class Config:
     env_options: str | None = None
     """reset options of a Memory Gym environment as JSON, over those of the training"""
     deterministic: bool = False
-    """take the most probable actions instead of drawing them"""
+    """take the most probable actions instead of sampling them"""
     seed: NonNegativeInt = 1
     """seed of the actions"""
     cuda: bool = True

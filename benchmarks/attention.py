@@ -11,7 +11,7 @@ Shape letters: N environments, one for each test level, H heads, M earlier steps
 """
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,14 +23,14 @@ import tyro
 from gymnasium.vector import VectorEnv, VectorWrapper
 from torch import nn
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
 
-import evaluate
 from enjoy import attention_weights
 from learning import FIRST_TEST_LEVEL
 from ppo_utils.checkpoints import Checkpoint
 from ppo_utils.environments import envs_for
 from ppo_utils.errors import RunError
+from ppo_utils.evaluation import evaluate
 from ppo_utils.flags import PositiveInt, check_bounds
 from ppo_utils.terminal import one_line_exit
 
@@ -126,34 +126,43 @@ def attended(agent: nn.Module, envs: Shown, levels: list[int]) -> tuple[float, l
 
     for number, block in enumerate(agent.memory.blocks):
         block.attention.register_forward_pre_hook(lambda _, given, number=number: add(number, given))
-    evaluate.evaluate(agent, envs, levels, sys.maxsize)
+    evaluate(agent, envs, levels, sys.maxsize)
     shares = np.concatenate(uniform)
     if not len(shares):
         raise ValueError("in these levels, no step could attend to what is looked for")
     return shares.mean(), [np.concatenate(each).mean(0) for each in weights]
 
 
-def main(config: Config) -> None:
-    """Print a table, an agent a row; raise ValueError for one of another task, and what evaluate.py raises."""
+def agents_of(config: Config, tasks: Iterable[str]) -> Iterator[tuple[str, nn.Module, VectorEnv, list[int]]]:
+    """Yield each agent's path, the agent, an environment for each test level, and the levels.
+
+    Raises ValueError if there is none or for one of another task, and what `Checkpoint.read` raises.
+    """
     check_bounds(config)
-    suitable = f"give agents that ppo_trxl.py trained in {', '.join(SUBJECTS)}"
+    whose = f"give agents of {', '.join(tasks)}"
     if not config.checkpoints:
-        raise ValueError(suitable)
-    levels = [*range(FIRST_TEST_LEVEL, FIRST_TEST_LEVEL + config.levels)]
-    rows = []
+        raise ValueError(whose)
     for path in config.checkpoints:
         checkpoint = Checkpoint.read(path)
-        args = checkpoint.args
-        if args.env_id not in SUBJECTS or not hasattr(args, "trxl_memory_length"):
-            raise ValueError(f"{path} was trained by {checkpoint.script.__name__}.py in {args.env_id}; {suitable}")
-        name, look = SUBJECTS[args.env_id]
-        envs = Shown(envs_for(args, config.levels), look)
+        if checkpoint.args.env_id not in tasks:
+            raise ValueError(f"{path} was trained in {checkpoint.args.env_id}; {whose}")
+        envs = envs_for(checkpoint.args, config.levels)
         agent = checkpoint.agent(envs, envs.reset()[1])
         torch.manual_seed(0)
-        share, blocks = attended(agent, envs, levels)
+        yield path, agent, envs, [*range(FIRST_TEST_LEVEL, FIRST_TEST_LEVEL + config.levels)]
+        envs.close()
+
+
+def main(config: Config) -> None:
+    """Print a table, an agent a row; raise ValueError for no transformer, and what `agents_of` and `evaluate` raise."""
+    rows = []
+    for path, agent, envs, levels in agents_of(config, SUBJECTS):
+        if not hasattr(agent.memory, "blocks"):
+            raise ValueError(f"{path} is no transformer; give agents that ppo_trxl.py trained")
+        name, look = SUBJECTS[envs.spec.id]
+        share, blocks = attended(agent, Shown(envs, look), levels)
         heads = "; ".join(", ".join(f"{100 * head:.0f}" for head in block) for block in blocks)
         rows.append(f"| `{Path(path).name}` | {name} | {100 * share:.0f} % | {heads} % |")
-        envs.close()
     print("\n".join([HEADING, *rows]))
 
 

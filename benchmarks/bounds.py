@@ -56,13 +56,15 @@ def play(task: Task, actions_of: Callable, levels: int = TEST_LEVELS, max_steps:
 
 
 def main(out: Path = BOUNDS, levels: int = TEST_LEVELS, max_steps: int = MAX_STEPS) -> None:
-    """Write the mean scores over levels.
+    """Write the mean scores over levels; raise ValueError for numbers that cannot work.
 
     Args:
         out: the file to write.
         levels: how many test levels to play.
         max_steps: steps after which an endless episode is cut short.
     """
+    if not 1 <= levels <= TEST_LEVELS or max_steps < 1:
+        raise ValueError(f"--levels must be 1 to {TEST_LEVELS}, --max-steps 1 or more; they are {levels}, {max_steps}")
     rows = [("task", "random", "scripted")]
     for name, task in (FINITE_SMALL | FULL).items():
         new = scored_levels(task.env_id, task.options)
@@ -74,5 +76,5 @@ def main(out: Path = BOUNDS, levels: int = TEST_LEVELS, max_steps: int = MAX_STE
 
 
 if __name__ == "__main__":
-    with one_line_exit(OSError):
+    with one_line_exit(OSError, ValueError):
         tyro.cli(main)

@@ -135,7 +135,7 @@ def heading(columns: list[str], lanes: tuple[int, int]) -> str:
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=2.0, help="time for each number (default: 2)")
     parser.add_argument("--num-envs", type=int, default=32, help="lanes of the vector environment (default: 32)")
@@ -143,7 +143,7 @@ def main() -> None:
     parser.add_argument("--ids", nargs="+", default=None, help="ids to measure (default: all)")
     args = parser.parse_args()
     lanes = (args.num_envs, args.many_envs)
-    if args.seconds <= 0 or min(lanes) < 1:
+    if not 0 < args.seconds < float("inf") or min(lanes) < 1:
         parser.error("--seconds, --num-envs and --many-envs must be positive")
     warnings.filterwarnings("ignore")
     originals = original_classes()

@@ -13,33 +13,28 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 import tyro
 from gymnasium.vector import VectorEnv, VectorWrapper
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # before other packages that are named evaluate
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the packages of this repository
 
-import evaluate
-from learning import FIRST_TEST_LEVEL
-from ppo_utils.checkpoints import Checkpoint
-from ppo_utils.environments import envs_for
+import attention
 from ppo_utils.errors import RunError
-from ppo_utils.flags import PositiveInt, check_bounds
+from ppo_utils.evaluation import evaluate
+from ppo_utils.flags import PositiveInt
 from ppo_utils.terminal import one_line_exit
 
 RIGHT = 1  # an action of Endless Mystery Path
 
 
 @dataclass
-class Config:
+class Config(attention.Config):
     """Let agents of the two tasks play."""
 
-    checkpoints: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """files that --save-model wrote"""
     levels: PositiveInt = 500
     """test levels to play, each once"""
 
@@ -93,22 +88,10 @@ ENDS = {"Endless-MysteryPath-v0": path_ends, "Endless-SearingSpotlights-v0": lig
 
 
 def main(config: Config) -> None:
-    """Print a line for each agent; raise ValueError for one of another task, and what evaluate.py raises."""
-    check_bounds(config)
-    if not config.checkpoints:
-        raise ValueError(f"give agents of {' or '.join(ENDS)}")
-    levels = [*range(FIRST_TEST_LEVEL, FIRST_TEST_LEVEL + config.levels)]
-    for path in config.checkpoints:
-        checkpoint = Checkpoint.read(path)
-        args = checkpoint.args
-        if args.env_id not in ENDS:
-            raise ValueError(f"{path} was trained in {args.env_id}; give agents of {' or '.join(ENDS)}")
-        envs = envs_for(args, config.levels)
-        agent = checkpoint.agent(envs, envs.reset()[1])
-        torch.manual_seed(0)
-        play = partial(evaluate.evaluate, agent, levels=levels, max_steps=sys.maxsize)
-        print(f"{path}: {ENDS[args.env_id](envs, play)}")
-        envs.close()
+    """Print a line for each agent; raise what `attention.agents_of` and `evaluate` raise."""
+    for path, agent, envs, levels in attention.agents_of(config, ENDS):
+        play = partial(evaluate, agent, levels=levels, max_steps=sys.maxsize)
+        print(f"{path}: {ENDS[envs.spec.id](envs, play)}")
 
 
 if __name__ == "__main__":

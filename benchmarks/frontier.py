@@ -73,5 +73,5 @@ def main(out: Path = Path("docs/frontier.png")) -> None:
 
 
 if __name__ == "__main__":
-    with one_line_exit(OSError):
+    with one_line_exit(OSError, ValueError):
         tyro.cli(main)

@@ -107,11 +107,11 @@ def make_original(folder: str) -> str:
 # ---- episodes ----
 
 
-def draw_options(rng: np.random.Generator, table: tuple[Any, ...], version: str = "1.0.2") -> dict[str, Any]:
+def sample_options(rng: np.random.Generator, table: tuple[Any, ...], version: str) -> dict[str, Any]:
     """Reset options: each of the table's that the version has, with the same chance, which is drawn as well."""
     table = tuple(option for option in table if option.name not in LACKS[version])
     chance, defaults = rng.choice([0.0, 0.1, 0.3, 1.0]), {option.name: option.default for option in table}
-    values = {option.name: draw_value(rng, option) for option in table if rng.random() < chance}
+    values = {option.name: sample_value(rng, option) for option in table if rng.random() < chance}
     if "num_spawns" in values:
         values["num_spawns"] = min(values["num_spawns"], 1000)
     for pair in (("spot_min_radius", "spot_max_radius"), ("spot_min_speed", "spot_max_speed")):
@@ -120,16 +120,16 @@ def draw_options(rng: np.random.Generator, table: tuple[Any, ...], version: str 
     return values
 
 
-def draw_value(rng: np.random.Generator, option: Any) -> Any:
+def sample_value(rng: np.random.Generator, option: Any) -> Any:
     """A value of one option, from anywhere in its range."""
     if option.kind == "bool":
         return bool(rng.integers(2))
     if option.kind == "ints":
-        return [draw_number(rng, option) for _ in range(rng.integers(not option.empty, 5))]
-    return draw_number(rng, option)
+        return [sample_number(rng, option) for _ in range(rng.integers(not option.empty, 5))]
+    return sample_number(rng, option)
 
 
-def draw_number(rng: np.random.Generator, option: Any) -> float:
+def sample_number(rng: np.random.Generator, option: Any) -> float:
     """An end of the range, anywhere in it, or mostly near its start; maybe a round number or a multiple of a root."""
     if option.also and rng.random() < 0.2:
         return option.also[0]
@@ -211,7 +211,9 @@ class Fuzz:
         self.envs = {env_id: gym.make(env_id, disable_env_checker=True).unwrapped for env_id in memory_gym_envs.IDS}
         command, self.seed = [original, str(Path(__file__).resolve()), "--serve"], seed
         self.original = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        self.version = json.loads(self.original.stdout.readline())
+        self.version = json.loads(self.original.stdout.readline() or "null")
+        if self.version not in LACKS:
+            sys.exit(f"{original} needs memory-gym {' or '.join(LACKS)}; it has {self.version or 'none'}")
         self.counts, self.known, self.differ = Counter(), Counter(), dict.fromkeys(KINDS, 0)
 
     def episode(self, ids: list[str], number: int) -> None:
@@ -219,7 +221,7 @@ class Fuzz:
         rng = np.random.default_rng([self.seed, number])
         env_id, level = str(rng.choice(ids or list(self.envs))), int(rng.integers(2**31))
         env = self.envs[env_id]
-        options = draw_options(rng, env.batch.variant.options, self.version)
+        options = sample_options(rng, env.batch.variant.options, self.version)
         rule = AS_IN[self.version].get(env_id, {})
         ours = play(env, level, options | rule, choose_actions(rng, env), theirs=False)
         print(json.dumps([env_id, level, options, ours["actions"]]), file=self.original.stdin, flush=True)
@@ -258,6 +260,8 @@ def main() -> int:
 
     if unknown := [each for each in args.ids or () if each not in memory_gym_envs.IDS]:
         parser.error(f"there is no {unknown[0]}; there are {', '.join(memory_gym_envs.IDS)}")
+    if min(args.seed, args.first) < 0:
+        parser.error("--seed and --first must be 0 or more")
     with tempfile.TemporaryDirectory() as folder:
         fuzz = Fuzz(args.original or make_original(folder), args.seed)
         number, end = args.first, time.monotonic() + 60 * args.minutes

@@ -70,9 +70,9 @@ class Training:
     seeds: tuple[int, ...] = (1, 2, 3)
     """a training run each"""
     jobs: PositiveInt = os.cpu_count() or 1
-    """runs at the same time; with images, they share the cores, or have OMP_NUM_THREADS threads each if that is set"""
+    """runs at the same time, of OMP_NUM_THREADS threads each, else of one, with images of their share of the cores"""
     evaluations: PositiveInt = 20
-    """at least so many evaluations of a training, at even distances, and one at its end"""
+    """at least so many evaluations of a training, at even distances, and one at its end; at most one an iteration"""
     folder: Path = Path("learning")
     """where the runs go"""
     results: Path = Path("learning/results")
@@ -251,7 +251,7 @@ def expected_hours(config: Training, missing: list[Plan]) -> str:
     seconds = sum(
         plan.args.total_timesteps / np.median(speeds[name]) for plan, name in zip(missing, scripts, strict=True)
     )
-    return f", about {seconds / 3600 / config.jobs:.1f} hours"
+    return f", about {seconds / 3600 / min(config.jobs, len(missing)):.1f} hours"
 
 
 RUNNING = set()  # training processes, to be stopped with this one
@@ -273,7 +273,7 @@ def steps_so_far(config: Training, plan: Plan) -> int:
 
 
 def environment(config: Training, plan: Plan) -> dict[str, str]:
-    """Return the variables for a training or its evaluation: a thread, with images those of its share of the cores."""
+    """Return the variables for a training or its evaluation: as many threads as `Training.jobs` says."""
     threads = 1 if plan.args.obs_type == "vector" else max(1, (os.cpu_count() or 1) // config.jobs)
     return {"OMP_NUM_THREADS": str(threads), **os.environ, "TQDM_MININTERVAL": "10"}
 
@@ -545,5 +545,5 @@ def main(config: Config) -> None:
 
 if __name__ == "__main__":
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
-    with one_line_exit(OSError, NoCurvesError):
+    with one_line_exit(OSError, ValueError):
         main(tyro.cli(Config))

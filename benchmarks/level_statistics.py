@@ -17,7 +17,6 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
-import memory_gym_envs  # noqa: F401 (registers the ids)
 from memory_gym_envs.character import FACINGS, PAD, agent_tables, free_controls, grid_controls, walk
 from memory_gym_envs.drawing import SCREEN
 from memory_gym_envs.mystery_path.rules import TILE_AT

@@ -23,10 +23,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
-import memory_gym_envs  # noqa: F401 (registers the ids)
 from learning import FIRST_TEST_LEVEL
 from memory_gym_envs.mortar_mayhem.drawing import SYMBOL, symbols
 from ppo_utils.acting import Player
+from ppo_utils.environments import is_memory_gym
 from ppo_utils.errors import RunError
 from ppo_utils.terminal import one_line_exit
 
@@ -60,6 +60,8 @@ def play(path: Path, level: int) -> tuple[list[Moment], dict[str, Any]]:
     """Return all moments of an episode, and its last info."""
     torch.manual_seed(1)
     player = Player(path)
+    if not is_memory_gym(player.args.env_id):
+        raise ValueError(f"{path} was trained in {player.args.env_id}; give an agent of a Memory Gym environment")
     make = functools.partial(gym.make, player.args.env_id, obs_type=player.args.obs_type)
     envs = make(render_mode="rgb_array"), make(render_mode="debug_rgb_array")
     options = json.loads(player.args.env_options)

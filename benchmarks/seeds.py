@@ -77,8 +77,7 @@ def draw_endless(results: dict[str, Runs], out: Path) -> None:
         axis.set(xscale="log", yscale="log", xlabel="steps", ylabel=TASKS[env_id].score)
         axis.set_title(env_id, fontsize=10)
         axis.grid(alpha=0.3)
-    handles = dict(zip(*reversed(figure.axes[0].get_legend_handles_labels()), strict=True))
-    figure.legend(handles.values(), handles, loc="outside right center", frameon=False)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center", frameon=False)
     figure.savefig(out, dpi=110)
 
 

@@ -102,10 +102,16 @@ def kill(config: Config) -> None:
     while count["kills"] < config.kills or wanted is None:
         name = f"run-{count['runs']}-{count['kills']}"
         flags, folder = arguments(config.iterations, name), None
-        # The first run is never killed: the others are compared with it.
-        while not comes_to_its_end(
-            config.script, flags, None if wanted is None else moments.uniform(0, config.seconds)
-        ):
+        while True:
+            # The first run is never killed: the others are compared with it. After the last kill, none is.
+            is_killed = wanted is not None and count["kills"] < config.kills
+            if comes_to_its_end(config.script, flags, moments.uniform(0, config.seconds) if is_killed else None):
+                found = scalars(next(Path("runs").glob(f"*__{name}__*")))
+                wanted = wanted or found
+                if found != wanted:
+                    raise RuntimeError(f"{name} has other scalars than the run that was never stopped")
+                count["runs"] += 1
+                break
             count["kills"] += 1
             folder = next(Path("runs").glob(f"*__{name}__*"), None)
             if folder is None or not list(folder.glob("checkpoint-*.pt")):
@@ -114,12 +120,6 @@ def kill(config: Config) -> None:
             count["while a file was written"] += bool(list(folder.glob("*.part")))
             flags = ["--resume", str(folder)]
             time.sleep(1)  # TensorBoard sorts files by the second they begin in
-        else:
-            found = scalars(next(Path("runs").glob(f"*__{name}__*")))
-            wanted = wanted or found
-            if found != wanted:
-                raise RuntimeError(f"{name} has other scalars than the run that was never stopped")
-            count["runs"] += 1
     print(
         f"{config.script}: {', '.join(f'{value} {name}' for name, value in count.items())}, all with the same scalars"
     )

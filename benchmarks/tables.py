@@ -76,7 +76,7 @@ def final_scores(name: str, runs: list[RunLog], every_level: bool = False) -> np
     levels = "test" if are_tested(name, runs) else "eval"
     scores = align([run.curves[f"{levels}/{name}"] for run in runs])[1][-1]
     args = runs[0].args
-    first, count = (int(args.get(name, 0)) for name in ("start_level", "num_levels"))
+    first, count = int(args.get("start_level", 0)), int(args.get("num_levels", 0))
     if every_level or levels == "eval" or not count or first + count > 100_000:  # of those, it is not known
         return scores
     new = scored_levels(args["env_id"], json.loads(args["env_options"]))

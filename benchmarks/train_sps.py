@@ -97,6 +97,9 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, in
     args.checkpoint_interval = 0
     short = replace(args, num_steps=32)
     run = script.setup(args)
+    if not run.agent.encoder.cnns:
+        close(run)
+        raise ValueError("the bounds are those of convolutions; choose an environment and flags with images")
     device = run.device
     cnn = script.AtariCNN(3)
     encoder = torch.nn.Sequential(cnn, torch.nn.Linear(3136, run.agent.memory.width), torch.nn.ReLU())
@@ -123,6 +126,8 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, in
 def main(config: Config) -> None:
     """Print a Markdown table, a row per rollout length. Raises ValueError, and what a script's `setup` raises."""
     check_bounds(config)
+    if min(config.chunks, default=0) < 1:
+        raise ValueError(f"--chunks is {' '.join(map(str, config.chunks)) or 'empty'}; give sizes of 1 frame or more")
     print(f"{config.script} on {config.env_id} {config.flags}, {torch.get_num_threads()} threads\n")
     print("| lanes x steps | steps/s | distinct | convolutions alone | share | encoder alone | share | best piece |")
     print("|---|---|---|---|---|---|---|---|")

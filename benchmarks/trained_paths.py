@@ -125,5 +125,5 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    with one_line_exit(OSError):
+    with one_line_exit(OSError, ValueError):
         main(tyro.cli(Config))

@@ -119,6 +119,8 @@ def step_times(config: Config, window: int) -> tuple[float, float]:
 def main(config: Config) -> None:
     """Print both tables. Raises ValueError, and what a script's `setup` raises."""
     check_bounds(config)
+    for window in config.windows:
+        check_bounds(ppo_trxl.Args(trxl_memory_length=window))
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)  # the run folder goes there
         shares(config)

@@ -24,5 +24,5 @@
     terminal       where programs write to, which may be closed or gone
     fast           what computes the same faster on a CPU
 
-No module here names a script; `checkpoints.import_script` imports the one that wrote a file.
+`checkpoints.import_script` imports the script that wrote a file.
 """

@@ -18,7 +18,7 @@ from ppo_utils.lanes import check_fits
 class Player:
     """Acts in one environment, an observation at a time: its memory goes on from call to call.
 
-    path: a model or a checkpoint. deterministic: take the most probable actions instead of drawing them. It makes one
+    path: a model or a checkpoint. deterministic: take the most probable actions instead of sampling them. It makes one
     environment of its training to ask for the spaces, and closes it.
 
     Raises ValueError, OSError, ImportError or gymnasium.error.Error, each with one line for the user.

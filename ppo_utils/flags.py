@@ -163,7 +163,7 @@ def check_bounds(args: RunArgs) -> None:
 def check_args(args: RunArgs) -> None:
     """Raise ValueError, naming the flag and what it may be, for the first value or combination that cannot work.
 
-    An integer that is given for a float in Python becomes one, so that logs spell both alike.
+    An integer that is given for a float in Python becomes one, so that logs spell both the same way.
     """
     plain = type_hints(type(args))
     for name, kind in type_hints(type(args), include_extras=True).items():

@@ -19,18 +19,18 @@ ENTRIES = 6  # of an observed vector
 class ScriptAdapter(Adapter):
     """The agent of `ppo_gru.py`, `ppo_trxl.py` or a copy of either, which observes a vector.
 
-    script: the module. args: its `Args`. weights_scale: of the heads, which hardly depend on anything at first.
+    script: the module. args: its `Args`. The heads' weights are tripled: they hardly depend on anything at first.
     """
 
     obs_shape = (ENTRIES,)
 
-    def __init__(self, script: ModuleType, args: Any, weights_scale: float = 3.0):
+    def __init__(self, script: ModuleType, args: Any):
         self.script, self.args, self.nvec = script, args, [3, 2]
         self.space = gym.spaces.Dict({"observation": gym.spaces.Box(-float("inf"), float("inf"), self.obs_shape)})
         self.agent = script.Agent(self.space, self.nvec, args)
         with torch.no_grad():
             for parameter in self.agent.heads.parameters():
-                parameter.mul_(weights_scale)
+                parameter.mul_(3.0)
 
     def initial(self, lanes: int) -> dict[str, Tensor]:
         """Return what `Memory.initial` does."""

@@ -290,8 +290,8 @@ def keeps_lanes_apart(case: Case) -> Finding:
             if wrong.any():
                 says = f"in {way}, a lane depends on other lanes' {what} ({first(wrong)}): "
                 return Finding("lanes", False, says + "a reset, a mask, padding or statistics hit the wrong lanes")
-        turned = run(case.obs[:, order], case.begins[:, order])
-        wrong = case.differs(before[:, order], turned)
+        permuted = run(case.obs[:, order], case.begins[:, order])
+        wrong = case.differs(before[:, order], permuted)
         if wrong.any():
             says = f"in {way}, a lane's outputs change with its place among the lanes ({first(wrong)})"
             return Finding("lanes", False, f"{says}: two axes are mixed up")
@@ -368,14 +368,14 @@ def values_final_observations(case: Case) -> Finding | None:
 
 
 def survives_saving(case: Case) -> Finding | None:
-    """A saved and loaded agent acts alike."""
+    """A saved and loaded agent acts the same."""
     other = case.adapter.reloaded()
     if other is None:
         return None
     with torch.no_grad():
         outputs, values, _, _ = other.rollout(case.obs.clone(), case.begins.clone(), other.initial(LANES))
     wrong = case.differs(joined(outputs, values), case.acted)
-    says = "a saved and loaded agent acts alike"
+    says = "a saved and loaded agent acts the same"
     if wrong.any():
         says = f"a saved and loaded agent acts differently ({first(wrong)}): something that it needs is not saved"
     return Finding("saving", not wrong.any(), says)

@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 import pictures
+import ppo_gru
 
 ROOT = Path(__file__).parents[1]
 
@@ -32,6 +34,14 @@ def test_six_steps(tmp_path, monkeypatch, capsys):
     assert steps[:6] == [f"step {round(end * part / 5)}" for part in range(6)]
     made, shown = (Image.open(folder / "mystery_path.png").size for folder in (tmp_path, ROOT / "docs"))
     assert made == shown
+
+
+def test_an_agent_of_another_package(tiny, monkeypatch, tmp_path):
+    """Its episodes have no debug view."""
+    monkeypatch.chdir(tmp_path)
+    ppo_gru.main(tiny(env_id="CartPole-v1", save_model=True))
+    with pytest.raises(ValueError, match=r"model\.pt was trained in CartPole-v1; give an agent of a Memory Gym"):
+        pictures.main(pictures.Config(next(Path("runs").glob("*/model.pt")), tmp_path / "agent.gif"))
 
 
 def test_a_strip_of_commands():

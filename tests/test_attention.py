@@ -107,9 +107,9 @@ def test_what_the_page_says(capsys):
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ((), "^give agents that ppo_trxl.py trained in MortarMayhem-v0, "),
-        (("mortar-mayhem-b-trxl",), "was trained by ppo_trxl.py in MortarMayhemB-v0; give agents"),
-        (("mystery-path-gru",), "was trained by ppo_gru.py in MysteryPath-v0; give agents"),
+        ((), "^give agents of MortarMayhem-v0, "),
+        (("mortar-mayhem-b-trxl",), "was trained in MortarMayhemB-v0; give agents"),
+        (("mystery-path-gru",), "is no transformer; give agents that ppo_trxl.py trained"),
     ],
 )
 def test_who_cannot_be_asked(config, message):

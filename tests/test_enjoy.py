@@ -32,6 +32,7 @@ import ppo_trxl
 from memory_gym_envs.character import PAD
 from memory_gym_envs.mystery_path.state import ROWS
 from ppo_utils.environments import as_tensors, envs_for, is_memory_gym
+from ppo_utils.errors import RunError
 from ppo_utils.evaluation import make_agent
 from ppo_utils.scores import own_metric
 
@@ -927,6 +928,16 @@ def test_diverged_weights(saved):
     model["weights"]["heads.value.2.bias"].fill_(torch.nan)
     torch.save(model, "model.pt")
     with pytest.raises(ValueError, match="holds weights that are not finite: the training diverged"):
+        enjoy.main(enjoy.Config("model.pt"))
+
+
+def test_a_policy_that_is_not_finite(saved):
+    """Of finite weights."""
+    saved()
+    model = torch.load("model.pt", weights_only=True)
+    model["weights"]["heads.policy.2.weight"].fill_(3e38)
+    torch.save(model, "model.pt")
+    with pytest.raises(RunError, match="the policy is not finite"):
         enjoy.main(enjoy.Config("model.pt"))
 
 

@@ -48,7 +48,7 @@ def test_what_is_said_of_an_agent(tiny, tmp_path, monkeypatch, capsys, env_id):
         calls.append((agent, envs, levels, play(agent, envs, levels, max_steps)))
         return calls[-1][-1]
 
-    monkeypatch.setattr(evaluate, "evaluate", spy)
+    monkeypatch.setattr(episode_ends, "evaluate", spy)
     capsys.readouterr()
     episode_ends.main(episode_ends.Config((path,), levels=20))
     ((agent, envs, levels, played),) = calls
@@ -86,9 +86,9 @@ def test_what_the_page_says_of_two_agents(capsys):
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"checkpoints": ()}, "give agents of Endless-MysteryPath-v0 or Endless-SearingSpotlights-v0"),
+        ({"checkpoints": ()}, "give agents of Endless-MysteryPath-v0, Endless-SearingSpotlights-v0"),
         ({"levels": 0}, "--levels is 0; it must be 1 or more"),
-        ({}, "was trained in MysteryPath-v0; give agents of Endless-MysteryPath-v0 or Endless-SearingSpotlights-v0"),
+        ({}, "was trained in MysteryPath-v0; give agents of Endless-MysteryPath-v0, Endless-SearingSpotlights-v0"),
     ],
 )
 def test_what_cannot_be_played(config, message):

@@ -410,6 +410,7 @@ def test_hours_of_trainings_are_expected_by_those_that_are_there(tmp_path):
         curves = {name: (np.array([36 * speed]), np.full((1, 1, 1), 36.0)) for name in SECONDS.values()}
         learning.write_run(RunLog("", plans[0].logged_args(), curves), f"{tmp_path}/X-v0/{speed}.json.gz")
     assert learning.expected_hours(config, plans) == ", about 1.4 hours"  # two million steps, two at a time
+    assert learning.expected_hours(config, plans[:1]) == ", about 1.4 hours"  # one is no faster
 
 
 def test_a_stopped_program_stops_its_trainings_with_a_checkpoint(tmp_path, curves):

@@ -319,6 +319,32 @@ def test_what_is_no_entry(entry, means, message):
         entry(*means)
 
 
+@pytest.mark.parametrize(
+    ("task", "target", "agent", "broken"),
+    [
+        ("SearingSpotlights-v0", 0.9, "GRU", []),
+        ("SearingSpotlights-v0", 0.8, "GRU", ["aimed at 0.9 of the best score"]),
+        ("Endless-MysteryPath-v0", 0.9, "GRU", ["aimed at 0.9 of the best score"]),
+        ("mortar-mayhem", 0.9, "GRU", ["on default options"]),
+        ("SearingSpotlights-v0", 0.9, "GRU --step-encoding", ["from vectors of what the image shows"]),
+        ("SearingSpotlights-v0", 0.9, "GRU --observe-last-action", ["from vectors of what the image shows"]),
+        ("SearingSpotlights-v0", 0.9, "GRU --obs-type pixels", ["from vectors of what the image shows"]),
+        ("SearingSpotlights-v0", 0.9, "GRU --load-model model.pt", ["trained from the first step on"]),
+        ("SearingSpotlights-v0", 0.9, "GRU --num-levels 0", ["on the default levels"]),
+    ],
+)
+def test_rules_of_an_entry(task, target, agent, broken):
+    run = run_with(0, 0, 0.95, metric=f"test/{TASKS[task].score}")
+    entry = speedrun.Entry(task, target, agent, 1_000_000, "", "")
+    assert [rule for rule, holds in speedrun.rules_of(entry, [run]).items() if not holds] == broken
+
+
+def test_an_entry_is_scored_on_test_levels():
+    run = run_with(0, 0, 0.95, metric="eval/success")
+    rules = speedrun.rules_of(speedrun.Entry("SearingSpotlights-v0", 0.9, "GRU", 1_000_000, "", ""), [run])
+    assert [rule for rule, holds in rules.items() if not holds] == ["scored on test levels"]
+
+
 @pytest.mark.parametrize("steps", ["6e6", "7e6"])
 def test_a_later_entry_needs_fewer_steps(entry, steps):
     """Of one task."""

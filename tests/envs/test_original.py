@@ -333,7 +333,7 @@ def test_fuzz_draws_valid_options(env_id):
     for version, rule in fuzz_original.AS_IN.items():
         lacks, drawn = fuzz_original.LACKS[version], set()
         for seed in range(100):
-            options = fuzz_original.draw_options(np.random.default_rng(seed), table, version)
+            options = fuzz_original.sample_options(np.random.default_rng(seed), table, version)
             complete_options(table, options | rule.get(env_id, {}), env_id)
             drawn |= options.keys()
         assert drawn == {option.name for option in table} - lacks
