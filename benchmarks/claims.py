@@ -586,8 +586,8 @@ def main(config: Config) -> None:
     for name, claim in claims.items():
         runs[name] = {agent: finished(config, seeds, results) for agent, seeds in plans[name].items()}
         bases = finished(config, without[name], results)
-        planned = [*plans[name].values(), without[name]]
-        if sum(map(len, planned)) == sum(map(len, [*runs[name].values(), bases])):
+        needed = [*runs[name].values(), *([bases] if claim.needs_memory else [])]
+        if all(learning.are_enough(found, config.seeds) for found in needed):
             verdicts[name] = judge(claim, runs[name], bases)
     print_tables(runs, verdicts)
 

@@ -65,8 +65,11 @@ def row(entry: Entry) -> str:
     """
     tasks, agents = (entry.task,), (entry.agent,)
     (runs,) = learning.stored_results(tasks=tasks, agents=agents, steps=entry.steps, seeds=SEEDS)[entry.task].values()
-    if not runs:
-        raise SystemExit(f"benchmarks/results has no runs of {entry.agent} in {entry.task}, {entry.steps:,} steps")
+    if len(runs) < len(SEEDS):
+        raise SystemExit(
+            f"benchmarks/results has {len(runs)} of {len(SEEDS)} seeds of {entry.agent} in {entry.task}, "
+            f"{entry.steps:,} steps"
+        )
     scores = tables.final_scores(TASKS[entry.task].score, runs)  # (R, M, E)
     p_value = probability(scores.mean((1, 2)), entry.target)
     rules = {**rules_of(entry, runs), f"above {entry.target:g}: p = {p_value:.3f}": p_value < ALPHA}

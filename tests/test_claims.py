@@ -262,12 +262,16 @@ def test_unknown_claim():
     [
         ("query-position-gru", (1, 2, 3), "0 are not decided, 1 not learned. 0 more were not tested."),
         ("query-position-gru", (1, 2), "0 are not decided, 0 not learned. 1 more were not tested."),
+        ("query-position-gru", (3, 4, 5), "0 are not decided, 1 not learned. 0 more were not tested."),
         ("memory-flat-list", (1, 2, 3), "0 are not decided, 1 not learned. 0 more were not tested."),
         ("normalized-no-memory", (), "1 are not decided, 0 not learned. 0 more were not tested."),
     ],
 )
 def test_what_is_learned_is_judged_by_all_runs_without_memory(monkeypatch, capsys, claim, seeds, counts):
-    """They have the claim's flags, and score higher than all agents; not where a task needs no memory."""
+    """They have the claim's flags, and score higher than all agents; not where a task needs no memory.
+
+    Three of five seeds are enough.
+    """
 
     def result_of(config, plan):
         without = plan.agent == f"no memory {claims.CLAIMS[claim].flags}".strip()
@@ -276,7 +280,7 @@ def test_what_is_learned_is_judged_by_all_runs_without_memory(monkeypatch, capsy
         return RunLog("", plan.logged_args(), curves) if not without or plan.seed in seeds else None
 
     monkeypatch.setattr(learning, "result_of", result_of)
-    claims.main(claims.Config(claims=(claim,), report=True))
+    claims.main(claims.Config(claims=(claim,), report=True, seeds=(1, 2, 3, 4, 5) if 5 in seeds else (1, 2, 3)))
     assert f" hold and 0 do not (0 of these 0 with a star), {counts}" in capsys.readouterr().out
 
 

@@ -393,12 +393,14 @@ def test_results_in_a_folder_with_brackets(tmp_path):
     assert learning.result_of(config, plan) is not None
 
 
-def test_stored_results_have_all_seeds_or_none(monkeypatch):
+def test_stored_results_have_all_seeds_or_three_or_none(monkeypatch):
     runs = {"GRU": [RunLog("", {}, {})] * 2, "TrXL": []}
     monkeypatch.setattr(learning, "results_of", lambda config, plans: {"mortar-mayhem": runs})
     assert learning.stored_results(tasks=("mortar-mayhem",), seeds=(1, 2)) == {"mortar-mayhem": runs}
     with pytest.raises(SystemExit, match=r"has 2 of 3 seeds of GRU in mortar-mayhem$"):
         learning.stored_results(tasks=("mortar-mayhem",))
+    runs["GRU"] *= 2
+    assert learning.stored_results(tasks=("mortar-mayhem",), seeds=(1, 2, 3, 4, 5)) == {"mortar-mayhem": runs}
 
 
 def test_hours_of_trainings_are_expected_by_those_that_are_there(tmp_path):

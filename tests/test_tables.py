@@ -308,7 +308,7 @@ def test_an_entry_has_its_score(entry, capsys):
 @pytest.mark.parametrize(
     ("means", "message"),
     [
-        ((), "has no runs of GRU in SearingSpotlights-v0, 6,000,000 steps"),
+        ((), "has 0 of 5 seeds of GRU in SearingSpotlights-v0, 6,000,000 steps"),
         ((0.95, 0.95, 0.95, 0.95), "has 4 of 5 seeds of GRU in SearingSpotlights-v0"),
         ((0.99, 0.99, 0.99, 0.85, 0.89), r"GRU in SearingSpotlights-v0 is not above 0.9: p = 0.1"),
         ((0.9,) * 5, r"is not above 0.9: p = nan"),
