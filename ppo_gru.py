@@ -13,7 +13,8 @@ Source: Marco Pleines, "Memory-based Deep Reinforcement Learning in Endless Impe
 called the thesis below: §5.2 is a section, (5.7) an equation. Defaults: table 6.1, "Final", without auxiliary losses.
 
 How to read: section 2 is the training loop, from the top down; 3 to 5 are what it is built from, 4 the memory; 6 makes
-everything. In ppo_utils/ is what does not depend on the algorithm, and faster ways to compute the same.
+everything. In ppo_utils/ is what any training needs, the scale of rewards, KL estimates, and faster ways to compute the
+same.
 
 Shape letters: T steps of a rollout, N environments, A action branches, B steps of a minibatch, S sequences in it, L
 steps of its longest sequence, I inputs and D width of the memory, P hidden vectors of an environment, F features of the
@@ -137,7 +138,7 @@ LAPTOP = {
 }  # fmt: skip
 QUICKSTART = {
     **LAPTOP, "preset": "quickstart",
-    # Two commands, each shown for one step, and six steps to carry one out.
+    # Two commands, each shown for one step; four steps to carry one out, and two on its tile while the others burn.
     "env_options": '{"command_count": [2], "command_show_duration": [1], "command_show_delay": [0], '
     '"explosion_delay": [4], "explosion_duration": [2]}',
     "hidden_size": 64, "trunk_size": 64, "num_steps": 32, "num_minibatches": 8, "init_lr": 4e-3,
@@ -204,20 +205,14 @@ class Rollout:
     log_probs: Tensor  # (T, N, A)
     values: Tensor  # (T, N)
     rewards: Tensor  # (T, N)
-    terminated: Tensor  # (T, N) the step ended its episode, other than by a time limit
-    truncated: Tensor  # (T, N) the step ended its episode by a time limit
-    truncation_values: Tensor  # (T, N) value of the final observation, 0 where not bootstrapped
+    done: Tensor  # (T, N) the step ended its episode, in one way or the other
+    truncation_values: Tensor  # (T, N) value of the final observation, 0 unless a time limit alone ended the episode
     initial_memory: dict[str, Tensor]  # what the memory began with, for --refresh-memory
     memory_state: MemoryState  # what the memory stored of each step
     last_value: Tensor | None = None  # (N,) of the observation after the last step
     first_occurrence: Tensor | None = None  # (T * N,) flat index of the first equal observation; see `encode`
     advantages: Tensor | None = None  # (T, N)
     returns: Tensor | None = None  # (T, N)
-
-    @property
-    def done(self) -> Tensor:
-        """(T, N) the step ended its episode, in one way or the other."""
-        return self.terminated | self.truncated
 
     @classmethod
     def allocate(cls, num_steps: int, carry: Carry, agent: Agent) -> Rollout:
@@ -232,8 +227,7 @@ class Rollout:
             log_probs=zeros(branches),
             values=zeros(),
             rewards=zeros(),
-            terminated=zeros(dtype=torch.bool),
-            truncated=zeros(dtype=torch.bool),
+            done=zeros(dtype=torch.bool),
             truncation_values=zeros(),
             initial_memory=carry.memory,
             memory_state=agent.memory.begin_rollout(carry.memory, num_steps),
@@ -264,16 +258,15 @@ def collect(
 
             with torch.autocast(device.type, enabled=False):  # for environments that compute with torch
                 obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
-            done = terminated | truncated
-            rollout.rewards[t] = torch.as_tensor(rewards)
-            rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
+            done = torch.as_tensor(terminated | truncated)
+            rollout.rewards[t], rollout.done[t] = torch.as_tensor(rewards), done
             if args.bootstrap_truncated and truncated.any():
                 final = as_tensors(final_observations(obs, infos, truncated), device)
                 value = agent.get_value(final, state)  # with the memory of the episode that ended
-                rollout.truncation_values[t] = value.where(rollout.truncated[t] & ~rollout.terminated[t], 0.0)
-            agent.memory.reset(state, torch.as_tensor(done))
+                rollout.truncation_values[t] = value.where(torch.as_tensor(truncated & ~terminated).to(device), 0.0)
+            agent.memory.reset(state, done)
             ground_truth = ground_truth_of(infos, args, ground_truth)
-            add_ended(episodes, infos, done)
+            add_ended(episodes, infos, done.numpy())
         rollout.last_value = agent.get_value(as_tensors(obs, device), state)
     rollout.first_occurrence = first_occurrences(rollout.obs)  # for speed: on a CPU, equal images are encoded once
     return rollout, Carry(obs, ground_truth, agent.memory.carry(state)), episodes
@@ -341,7 +334,7 @@ def ppo_loss(
     if agent.estimator is not None:  # (5.6)
         logs["ground_truth_loss"] = F.mse_loss(agent.estimator(features), gather(rollout.ground_truth))
         loss = loss + args.ground_truth_coef * logs["ground_truth_loss"]
-    logs |= {"loss": loss, **policy_metrics(log_ratio, args.clip_coef)}
+    logs |= {"loss": loss, **policy_metrics(log_ratio, args.clip_coef)}  # among them what --target-kl limits
     return loss, {name: value.detach() for name, value in logs.items()}
 
 
@@ -366,12 +359,11 @@ def clip_gradients(agent: Agent, args: Args) -> Tensor:
 
     With --auxiliary-detach, each auxiliary head is clipped by itself, so that it does not change the agent's step.
     """
-    groups = defaultdict(list)
-    for name, parameter in agent.named_parameters():
-        part = name.partition(".")[0]
-        groups[part if args.auxiliary_detach and part in agent.auxiliary else "agent"].append(parameter)
-    norms = {part: nn.utils.clip_grad_norm_(group, args.max_grad_norm) for part, group in groups.items()}  # in place
-    return norms["agent"]
+    apart = agent.auxiliary if args.auxiliary_detach else ()
+    for network in filter(None, (getattr(agent, name) for name in apart)):
+        nn.utils.clip_grad_norm_(network.parameters(), args.max_grad_norm)  # in place
+    others = [weight for name, weight in agent.named_parameters() if name.partition(".")[0] not in apart]
+    return nn.utils.clip_grad_norm_(others, args.max_grad_norm)
 
 
 # ---- 3 PPO ----
@@ -449,9 +441,8 @@ class Pieces:
     def from_starts(cls, starts: Tensor) -> Pieces:
         """Make pieces that begin at every step where starts (T, N) is true; starts[0] has to be."""
         num_steps, num_envs = starts.shape
-        cuts = starts.T.flatten().nonzero()[:, 0]  # environment after environment: n * T + t
-        length = torch.diff(cuts, append=torch.tensor([num_steps * num_envs]))
-        n, t = cuts // num_steps, cuts % num_steps
+        n, t = starts.T.nonzero().unbind(-1)  # (S,) each, environment after environment
+        length = torch.diff(n * num_steps + t, append=torch.tensor([num_steps * num_envs]))
         return cls(t * num_envs + n, length, num_envs)
 
     def is_real(self) -> Tensor:
@@ -518,7 +509,8 @@ class Memory(nn.Module):
         super().__init__()
         if args.memory == "none" and (args.seq_len or args.num_layers > 1 or args.refresh_memory):
             raise ValueError("--seq-len, --num-layers and --refresh-memory need --memory gru or lstm")
-        self.kind, self.seq_len = args.memory, args.seq_len
+        self.kind = args.memory
+        self.seq_len = 1 if args.memory == "none" else args.seq_len  # without memory, a step is a piece by itself
         self.width = inputs if args.memory == "none" else args.hidden_size
         self.hidden_vectors = args.num_layers * {"gru": 1, "lstm": 2, "none": 0}[args.memory]
         if args.memory != "none":
@@ -567,14 +559,11 @@ class Memory(nn.Module):
     def cut(self, done: Tensor) -> Pieces:
         """Cut a rollout, whose episodes end where done (T, N) is true, into sequences."""
         starts = torch.ones_like(done)
-        if self.kind == "none":
-            return Pieces.from_starts(starts)  # every step by itself
         starts[1:] = done[:-1]
-        if self.seq_len:
-            t = torch.arange(len(done))[:, None]
-            began = torch.where(starts, t, 0).cummax(0).values  # (T, N) the episode's first step in this rollout
-            starts = (t - began) % self.seq_len == 0
-        return Pieces.from_starts(starts)
+        t = torch.arange(len(done))[:, None]
+        began = torch.where(starts, t, 0).cummax(0).values  # (T, N) the episode's first step in this rollout
+        length = self.seq_len or len(done)  # 0: no episode is cut
+        return Pieces.from_starts((t - began) % length == 0)
 
     def unroll(self, state: MemoryState, x: Tensor, pieces: Pieces) -> Tensor:
         """Run whole sequences: x (B, I) to (B, D), each from the stored hidden state of its first step."""
@@ -636,9 +625,8 @@ class Encoder(nn.Module):
         self.images = [name for name, space in spaces.items() if len(space.shape) == 3]
         self.vectors = [name for name, space in spaces.items() if len(space.shape) == 1]
         self.cnns = nn.ModuleList(AtariCNN(spaces[name].shape[2]) for name in self.images)
-        with torch.no_grad():
-            blank = [torch.zeros(1, *spaces[name].shape) for name in self.images]
-            features = sum(cnn(image).shape[1] for cnn, image in zip(self.cnns, blank, strict=True))
+        blank = [torch.zeros(1, *spaces[name].shape) for name in self.images]
+        features = sum(cnn(image).shape[1] for cnn, image in zip(self.cnns, blank, strict=True))
         if self.vectors:
             self.mlp = layer_init(nn.Linear(sum(spaces[name].shape[0] for name in self.vectors), 128))
             features += 128
@@ -659,13 +647,13 @@ class Encoder(nn.Module):
 class Heads(nn.Module):
     """The layer after the memory, the multi-discrete policy and the state value (table 6.2)."""
 
-    def __init__(self, width: int, lists: dict[str, tuple[int, int]], nvec: list[int], size: int, value_gain: float):
+    def __init__(self, width: int, shapes: dict[str, tuple[int, int]], nvec: list[int], size: int, value_gain: float):
         super().__init__()
         self.nvec = nvec  # number of actions of each branch, as Gymnasium calls it
         # An observed list, (rows, columns), is read by attention: the memory's output gives each of its rows a score.
-        self.scores = nn.ModuleDict({name: mlp_head(width, rows, 1.0) for name, (rows, _) in lists.items()})
-        self.trunk = layer_init(nn.Linear(width + sum(columns for _, columns in lists.values()), size))
-        self.policy = mlp_head(size, sum(nvec), 0.1)
+        self.scores = nn.ModuleDict({name: mlp_head(width, rows, 1.0) for name, (rows, _) in shapes.items()})
+        self.trunk = layer_init(nn.Linear(width + sum(columns for _, columns in shapes.values()), size))
+        self.policy = mlp_head(size, sum(nvec), 0.1)  # as in the author's code: nearly uniform at first
         self.value = mlp_head(size, 1, value_gain)
 
     def forward(self, x: Tensor, obs: dict[str, Tensor]) -> tuple[list[Categorical], Tensor, Tensor]:
@@ -726,8 +714,8 @@ class Agent(nn.Module):
         super().__init__()
         self.encoder = Encoder(space.spaces, Memory.input_width(args) if args.embedding else None)
         self.memory = Memory(args, self.encoder.width)
-        lists = {name: each.shape for name, each in space.items() if len(each.shape) == 2}
-        self.heads = Heads(self.memory.width, lists, nvec, args.trunk_size, args.value_init_gain)
+        list_shapes = {name: each.shape for name, each in space.items() if len(each.shape) == 2}
+        self.heads = Heads(self.memory.width, list_shapes, nvec, args.trunk_size, args.value_init_gain)
         images = [space[name].shape for name in self.encoder.images]
         if args.reconstruction_coef and len(images) != 1:
             raise ValueError(f"--reconstruction-coef needs an observation with one image, not {len(images)}; use 0")
@@ -765,6 +753,11 @@ class Agent(nn.Module):
         return policy, log_probs_of(policy, actions), values, features
 
 
+def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
+    """Return the log-probability (B, A) of the chosen action (B, A) of every branch."""
+    return torch.stack([branch.log_prob(action) for branch, action in zip(policy, actions.unbind(-1), strict=True)], -1)
+
+
 def make_optimizers(agent: Agent, args: Args) -> list[torch.optim.Optimizer]:
     """Return AdamW, and with --optimizer muon also Muon (Jordan et al., 2024) for the matrices between hidden layers.
 
@@ -783,11 +776,6 @@ def make_optimizers(agent: Agent, args: Args) -> list[torch.optim.Optimizer]:
         return [adamw]
     group = {"params": hidden, "lr": 3.0 * args.init_lr, "lr_ratio": 3.0}
     return [adamw, Muon([group], weight_decay=0.01, adjust_lr_fn="match_rms_adamw")]
-
-
-def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
-    """Return the log-probability (B, A) of the chosen action (B, A) of every branch."""
-    return torch.stack([branch.log_prob(action) for branch, action in zip(policy, actions.unbind(-1), strict=True)], -1)
 
 
 # ---- 6 MAIN ----

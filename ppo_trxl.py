@@ -10,13 +10,14 @@ without gradient, before each epoch but the first.
 
 No query gets a copy of its window. While acting, a hidden state is projected to its key and value once, into a cache,
 and the window's again at the start of each rollout. In the update, a rollout and the window before it are a timeline,
-cut into segments, whose queries attend to their own steps and to those before, all projected once, under one band mask.
+cut into segments, whose queries share the keys of their own steps and of those before, under one band mask.
 
 Source: Marco Pleines, "Memory-based Deep Reinforcement Learning in Endless Imperfect Information Games", dissertation,
 called the thesis below: §5.3 is a section, (5.7) an equation. Defaults: table 6.1, "Final", without auxiliary losses.
 
 How to read: section 2 is the training loop, from the top down; 3 to 5 are what it is built from, 4 the memory; 6 makes
-everything. In ppo_utils/ is what does not depend on the algorithm, and faster ways to compute the same.
+everything. In ppo_utils/ is what any training needs, the scale of rewards, KL estimates, and faster ways to compute the
+same.
 
 Shape letters: T steps of a rollout, N environments, A action branches, B steps of a minibatch, S segments in it, L
 steps of its longest segment, W window, M keys that are attended to, K blocks, H attention heads, D width of the memory
@@ -155,7 +156,7 @@ LAPTOP = {
 }  # fmt: skip
 QUICKSTART = {
     **LAPTOP, "preset": "quickstart",
-    # Two commands, each shown for one step, and six steps to carry one out.
+    # Two commands, each shown for one step; four steps to carry one out, and two on its tile while the others burn.
     "env_options": '{"command_count": [2], "command_show_duration": [1], "command_show_delay": [0], '
     '"explosion_delay": [4], "explosion_duration": [2]}', "total_timesteps": 400_000,
     "trunk_size": 64, "num_steps": 32, "num_minibatches": 8, "gamma": 0.99, "vf_coef": 0.5, "init_lr": 4e-3,
@@ -221,20 +222,14 @@ class Rollout:
     log_probs: Tensor  # (T, N, A)
     values: Tensor  # (T, N)
     rewards: Tensor  # (T, N)
-    terminated: Tensor  # (T, N) the step ended its episode, other than by a time limit
-    truncated: Tensor  # (T, N) the step ended its episode by a time limit
-    truncation_values: Tensor  # (T, N) value of the final observation, 0 where not bootstrapped
+    done: Tensor  # (T, N) the step ended its episode, in one way or the other
+    truncation_values: Tensor  # (T, N) value of the final observation, 0 unless a time limit alone ended the episode
     initial_memory: dict[str, Tensor]  # what the memory began with, for --refresh-memory
     memory_state: MemoryState  # what the memory stored of each step
     last_value: Tensor | None = None  # (N,) of the observation after the last step
     first_occurrence: Tensor | None = None  # (T * N,) flat index of the first equal observation; see `encode`
     advantages: Tensor | None = None  # (T, N)
     returns: Tensor | None = None  # (T, N)
-
-    @property
-    def done(self) -> Tensor:
-        """(T, N) the step ended its episode, in one way or the other."""
-        return self.terminated | self.truncated
 
     @classmethod
     def allocate(cls, num_steps: int, carry: Carry, agent: Agent) -> Rollout:
@@ -249,8 +244,7 @@ class Rollout:
             log_probs=zeros(branches),
             values=zeros(),
             rewards=zeros(),
-            terminated=zeros(dtype=torch.bool),
-            truncated=zeros(dtype=torch.bool),
+            done=zeros(dtype=torch.bool),
             truncation_values=zeros(),
             initial_memory=carry.memory,
             memory_state=agent.memory.begin_rollout(carry.memory, num_steps),
@@ -281,16 +275,15 @@ def collect(
 
             with torch.autocast(device.type, enabled=False):  # for environments that compute with torch
                 obs, rewards, terminated, truncated, infos = envs.step(actions.cpu().numpy())
-            done = terminated | truncated
-            rollout.rewards[t] = torch.as_tensor(rewards)
-            rollout.terminated[t], rollout.truncated[t] = torch.as_tensor(terminated), torch.as_tensor(truncated)
+            done = torch.as_tensor(terminated | truncated)
+            rollout.rewards[t], rollout.done[t] = torch.as_tensor(rewards), done
             if args.bootstrap_truncated and truncated.any():
                 final = as_tensors(final_observations(obs, infos, truncated), device)
                 value = agent.get_value(final, state)  # with the memory of the episode that ended
-                rollout.truncation_values[t] = value.where(rollout.truncated[t] & ~rollout.terminated[t], 0.0)
-            agent.memory.reset(state, torch.as_tensor(done))
+                rollout.truncation_values[t] = value.where(torch.as_tensor(truncated & ~terminated).to(device), 0.0)
+            agent.memory.reset(state, done)
             ground_truth = ground_truth_of(infos, args, ground_truth)
-            add_ended(episodes, infos, done)
+            add_ended(episodes, infos, done.numpy())
         rollout.last_value = agent.get_value(as_tensors(obs, device), state)
     rollout.first_occurrence = first_occurrences(rollout.obs)  # for speed: on a CPU, equal images are encoded once
     return rollout, Carry(obs, ground_truth, agent.memory.carry(state)), episodes
@@ -358,7 +351,7 @@ def ppo_loss(
     if agent.estimator is not None:  # (5.6)
         logs["ground_truth_loss"] = F.mse_loss(agent.estimator(features), gather(rollout.ground_truth))
         loss = loss + args.ground_truth_coef * logs["ground_truth_loss"]
-    logs |= {"loss": loss, **policy_metrics(log_ratio, args.clip_coef)}
+    logs |= {"loss": loss, **policy_metrics(log_ratio, args.clip_coef)}  # among them what --target-kl limits
     return loss, {name: value.detach() for name, value in logs.items()}
 
 
@@ -383,12 +376,11 @@ def clip_gradients(agent: Agent, args: Args) -> Tensor:
 
     With --auxiliary-detach, each auxiliary head is clipped by itself, so that it does not change the agent's step.
     """
-    groups = defaultdict(list)
-    for name, parameter in agent.named_parameters():
-        part = name.partition(".")[0]
-        groups[part if args.auxiliary_detach and part in agent.auxiliary else "agent"].append(parameter)
-    norms = {part: nn.utils.clip_grad_norm_(group, args.max_grad_norm) for part, group in groups.items()}  # in place
-    return norms["agent"]
+    apart = agent.auxiliary if args.auxiliary_detach else ()
+    for network in filter(None, (getattr(agent, name) for name in apart)):
+        nn.utils.clip_grad_norm_(network.parameters(), args.max_grad_norm)  # in place
+    others = [weight for name, weight in agent.named_parameters() if name.partition(".")[0] not in apart]
+    return nn.utils.clip_grad_norm_(others, args.max_grad_norm)
 
 
 # ---- 3 PPO ----
@@ -466,9 +458,8 @@ class Pieces:
     def from_starts(cls, starts: Tensor) -> Pieces:
         """Make pieces that begin at every step where starts (T, N) is true; starts[0] has to be."""
         num_steps, num_envs = starts.shape
-        cuts = starts.T.flatten().nonzero()[:, 0]  # environment after environment: n * T + t
-        length = torch.diff(cuts, append=torch.tensor([num_steps * num_envs]))
-        n, t = cuts // num_steps, cuts % num_steps
+        n, t = starts.T.nonzero().unbind(-1)  # (S,) each, environment after environment
+        length = torch.diff(n * num_steps + t, append=torch.tensor([num_steps * num_envs]))
         return cls(t * num_envs + n, length, num_envs)
 
     def is_real(self) -> Tensor:
@@ -580,7 +571,7 @@ class Memory(nn.Module):
         """Return what the next rollout goes on with: the last W rows, and the steps of the episodes."""
         rows = slice(state.now - self.window, state.now)
         parts = {"hidden": state.hidden[rows], "row_step": state.row_step[rows], "episode_step": state.episode_step}
-        return {name: part.clone() for name, part in parts.items()}
+        return {name: part.clone() for name, part in parts.items()}  # a view would keep all T rows
 
     @torch.no_grad()
     def begin_rollout(self, carry: dict[str, Tensor], num_steps: int) -> MemoryState:
@@ -592,7 +583,7 @@ class Memory(nn.Module):
         key_columns, _, mask = attended_keys(episode_step[:, None], self.window, hidden.device)  # (M,), (N, 1, M)
         attended = hidden[key_columns].transpose(0, 1)  # (N, M, K, D)
         attended = attended.masked_fill(~mask[:, 0, :, None, None], 0.0)
-        position = self.position(row_step[key_columns].T, attended)  # (N, M, D)
+        position = self.key_position(row_step[key_columns].T, attended)  # (N, M, D)
         room = (0, 0, self.window - len(key_columns), num_steps)  # zeros before and after M columns of keys and values
         projected = [block.keys_values(attended[:, :, k] + position) for k, block in enumerate(self.blocks)]
         return MemoryState(
@@ -623,7 +614,7 @@ class Memory(nn.Module):
             raise IndexError("there is no room for this step; begin_rollout(carry(state), num_steps) makes room again")
         state.hidden[state.now] = hidden
         state.row_step[state.now] = state.episode_step
-        position = self.position(state.episode_step, hidden)  # (N, D)
+        position = self.key_position(state.episode_step, hidden)  # (N, D)
         for k, block in enumerate(self.blocks):
             state.keys[k][:, state.now], state.values[k][:, state.now] = block.keys_values(hidden[:, k] + position)
         state.episode_step = state.episode_step + 1
@@ -655,8 +646,9 @@ class Memory(nn.Module):
         hidden = state.hidden[rows.to(x.device), env.to(x.device)]  # (S, M, K, D)
         hidden = hidden.masked_fill(~attended[..., None], 0.0)
         x = pieces.pad(x)  # (S, L, D)
-        before = int((key_columns < 0).sum())  # keys of the steps before a segment, which come first
-        key_position, query_position = self.position(state.row_step[rows, env], x), self.encode_step(episode_step, x)
+        before = -int(key_columns[0])  # keys of the steps before a segment, which come first
+        key_position = self.key_position(state.row_step[rows, env], x)  # (S, M, D)
+        query_position = self.encode_step(episode_step, x)  # (S, L, D)
         for k, block in enumerate(self.blocks):
             inputs = hidden[:, :, k]  # (S, M, D)
             if self.memory_gradient:
@@ -673,7 +665,7 @@ class Memory(nn.Module):
             return sinusoid(episode_step.to(like.device), self.width).to(like.dtype)
         return self.sinusoids[episode_step.to(like.device)].to(like.dtype)
 
-    def position(self, episode_step: Tensor, like: Tensor) -> Tensor | float:
+    def key_position(self, episode_step: Tensor, like: Tensor) -> Tensor | float:
         """Return what is added to hidden states of these steps (...): their encoding (..., D), or 0."""
         return self.encode_step(episode_step, like) if self.encoding in ("absolute", "learned") else 0.0
 
@@ -857,9 +849,8 @@ class Encoder(nn.Module):
         self.images = [name for name, space in spaces.items() if len(space.shape) == 3]
         self.vectors = [name for name, space in spaces.items() if len(space.shape) == 1]
         self.cnns = nn.ModuleList(AtariCNN(spaces[name].shape[2]) for name in self.images)
-        with torch.no_grad():
-            blank = [torch.zeros(1, *spaces[name].shape) for name in self.images]
-            features = sum(cnn(image).shape[1] for cnn, image in zip(self.cnns, blank, strict=True))
+        blank = [torch.zeros(1, *spaces[name].shape) for name in self.images]
+        features = sum(cnn(image).shape[1] for cnn, image in zip(self.cnns, blank, strict=True))
         if self.vectors:
             self.mlp = layer_init(nn.Linear(sum(spaces[name].shape[0] for name in self.vectors), 128))
             features += 128
@@ -880,13 +871,13 @@ class Encoder(nn.Module):
 class Heads(nn.Module):
     """The layer after the memory, the multi-discrete policy and the state value (table 6.2)."""
 
-    def __init__(self, width: int, lists: dict[str, tuple[int, int]], nvec: list[int], size: int, value_gain: float):
+    def __init__(self, width: int, shapes: dict[str, tuple[int, int]], nvec: list[int], size: int, value_gain: float):
         super().__init__()
         self.nvec = nvec  # number of actions of each branch, as Gymnasium calls it
         # An observed list, (rows, columns), is read by attention: the memory's output gives each of its rows a score.
-        self.scores = nn.ModuleDict({name: mlp_head(width, rows, 1.0) for name, (rows, _) in lists.items()})
-        self.trunk = layer_init(nn.Linear(width + sum(columns for _, columns in lists.values()), size))
-        self.policy = mlp_head(size, sum(nvec), 0.1)
+        self.scores = nn.ModuleDict({name: mlp_head(width, rows, 1.0) for name, (rows, _) in shapes.items()})
+        self.trunk = layer_init(nn.Linear(width + sum(columns for _, columns in shapes.values()), size))
+        self.policy = mlp_head(size, sum(nvec), 0.1)  # as in the author's code: nearly uniform at first
         self.value = mlp_head(size, 1, value_gain)
 
     def forward(self, x: Tensor, obs: dict[str, Tensor]) -> tuple[list[Categorical], Tensor, Tensor]:
@@ -947,8 +938,8 @@ class Agent(nn.Module):
         super().__init__()
         self.encoder = Encoder(space.spaces, Memory.input_width(args) if args.embedding else None)
         self.memory = Memory(args, self.encoder.width)
-        lists = {name: each.shape for name, each in space.items() if len(each.shape) == 2}
-        self.heads = Heads(self.memory.width, lists, nvec, args.trunk_size, args.value_init_gain)
+        list_shapes = {name: each.shape for name, each in space.items() if len(each.shape) == 2}
+        self.heads = Heads(self.memory.width, list_shapes, nvec, args.trunk_size, args.value_init_gain)
         images = [space[name].shape for name in self.encoder.images]
         if args.reconstruction_coef and len(images) != 1:
             raise ValueError(f"--reconstruction-coef needs an observation with one image, not {len(images)}; use 0")
@@ -986,6 +977,11 @@ class Agent(nn.Module):
         return policy, log_probs_of(policy, actions), values, features
 
 
+def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
+    """Return the log-probability (B, A) of the chosen action (B, A) of every branch."""
+    return torch.stack([branch.log_prob(action) for branch, action in zip(policy, actions.unbind(-1), strict=True)], -1)
+
+
 def make_optimizers(agent: Agent, args: Args) -> list[torch.optim.Optimizer]:
     """Return AdamW, and with --optimizer muon also Muon (Jordan et al., 2024) for the matrices between hidden layers.
 
@@ -1004,11 +1000,6 @@ def make_optimizers(agent: Agent, args: Args) -> list[torch.optim.Optimizer]:
         return [adamw]
     group = {"params": hidden, "lr": 3.0 * args.init_lr, "lr_ratio": 3.0}
     return [adamw, Muon([group], weight_decay=0.01, adjust_lr_fn="match_rms_adamw")]
-
-
-def log_probs_of(policy: list[Categorical], actions: Tensor) -> Tensor:
-    """Return the log-probability (B, A) of the chosen action (B, A) of every branch."""
-    return torch.stack([branch.log_prob(action) for branch, action in zip(policy, actions.unbind(-1), strict=True)], -1)
 
 
 # ---- 6 MAIN ----

@@ -10,6 +10,7 @@ speed changes from minute to minute.
 
 On a CPU, a script encodes equal observations of a minibatch once, and may overtake a bound where there are many:
 `distinct` is the share of an update's observations that it encodes, under a policy that has learned next to nothing.
+What a fast path brings is the ratio of two runs, one of them --without it.
 """
 
 import importlib
@@ -23,11 +24,12 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import torch
 import tyro
+from torch.nn.utils.rnn import pad_sequence
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
@@ -55,6 +57,23 @@ class Config:
     """sizes of piece that the bound may choose from"""
     flags: str = ""
     """further flags of the script in one argument, e.g. --flags='--memory lstm'"""
+    without: list[Literal["packed_gru", "first_occurrences", "in_chunks", "Muon"]] = field(default_factory=list)
+    """fast paths of ppo_utils/fast.py that the script does without"""
+
+
+def padded_gru(rnn: torch.nn.GRU, x: torch.Tensor, lengths: torch.Tensor, hidden: torch.Tensor) -> torch.Tensor:
+    """Compute what `packed_gru` does with the library's GRU, over padded sequences."""
+    padded = pad_sequence(x.split(lengths.tolist()), batch_first=True)
+    y, _ = rnn(padded, hidden.transpose(0, 1).contiguous())
+    return torch.cat([sequence[:length] for sequence, length in zip(y, lengths.tolist(), strict=True)])
+
+
+PLAIN = {  # what each fast path replaces
+    "packed_gru": padded_gru,
+    "first_occurrences": lambda obs: None,
+    "in_chunks": lambda network, x: network(x),
+    "Muon": torch.optim.Muon,
+}
 
 
 def seconds(work: Callable[[], None], device: torch.device) -> float:
@@ -91,6 +110,8 @@ def one_iteration(script: ModuleType, args: Any, run: Any) -> None:
 def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, int]:
     """Return the steps/s of the script and of both bounds, the share of distinct pictures, and the best piece."""
     script = importlib.import_module(config.script)
+    for name in config.without:
+        setattr(script, name, PLAIN[name])
     flags = f"--env-id {config.env_id} --num-envs {config.num_envs} --num-steps {num_steps} {config.flags}"
     args = parse_args(script.Args, script.PRESETS, flags.split())
     args.total_timesteps = config.num_envs * num_steps  # of one call of train

@@ -288,14 +288,14 @@ def is_memory_gym(env_id: str) -> bool:
     return isinstance(made, type) and issubclass(made, MemoryGymVectorEnv)
 
 
-def json_object(flag: str, text: str) -> dict[str, Any]:
-    """Parse a flag's JSON object; raise ValueError if it is none."""
+def json_object(name: str, text: str) -> dict[str, Any]:
+    """Parse the JSON object of a flag of this name; raise ValueError if it is none."""
     try:
         found = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{flag} is no JSON ({error}): {brief(text)}") from None
+        raise ValueError(f"{name} is no JSON ({error}): {brief(text)}") from None
     if not isinstance(found, dict):
-        raise ValueError(f'{flag} must be a JSON object such as {{"size": 9}}, not {text}')
+        raise ValueError(f'{name} must be a JSON object such as {{"size": 9}}, not {text}')
     return found
 
 

@@ -83,7 +83,7 @@ def test_the_ground_truth_belongs_to_the_observation(played, script, ends):
     assert not ends or run.rollout.done.all(1).any()
     envs = envs_for(args, args.num_envs, seed=args.seed)
     _, infos = envs.reset()
-    assert run.rollout.terminated.any()
+    assert run.rollout.done.any()
     for t in range(32):
         assert run.rollout.ground_truth[t].numpy() == pytest.approx(infos["ground_truth"])
         *_, infos = envs.step(run.rollout.actions[t].numpy())

@@ -102,7 +102,7 @@ def test_the_total_loss_is_composed_as_in_equation_5_7(played):
         for parameter in agent.heads.policy[-1].parameters():
             parameter.zero_()
         rollout.log_probs.fill_(math.log(0.5))  # what this uniform policy would have stored
-    pieces = agent.memory.cut(rollout.terminated)
+    pieces = agent.memory.cut(rollout.done)
     rollout.advantages, rollout.returns = rollout.rewards + 1, rollout.rewards
     loss, logs = ppo_loss(agent, rollout, pieces, 5.0, args)
     assert logs["entropy"].item() == pytest.approx(2 * math.log(2)), "the sum over both branches"
@@ -123,7 +123,7 @@ def test_values_are_clipped_around_the_rollout_s(played, clip_vloss):
     """All returns are 2 above the rollout's values, and the present values 1: clipped at 0.1, they miss 1.9."""
     args, run, *_ = played(env_id="CueRecall-v0", clip_vloss=clip_vloss, clip_coef=0.1)
     rollout, agent = run.rollout, run.agent
-    pieces = agent.memory.cut(rollout.terminated)
+    pieces = agent.memory.cut(rollout.done)
     rollout.values -= 1
     rollout.returns = rollout.values + 2
     logs = ppo_loss(agent, rollout, pieces, 0.0, args)[1]

@@ -90,8 +90,8 @@ def test_ratio_is_one_for_every_sample(played, env_id, obs_type, memory):
     played_values = rollout.values.flatten(0, 1)[index]  # up to 15, as the heads' weights were scaled up
     assert (values - played_values).abs().max() < 1e-5 * played_values.abs().max().clamp(min=1)
     if env_id == "CueRecall-v0":
-        assert rollout.terminated.any()
-        assert not rollout.terminated[-1].all()
+        assert rollout.done.any()
+        assert not rollout.done[-1].all()
 
 
 @each_memory(MEMORIES)
@@ -269,9 +269,8 @@ def test_truncation_bootstraps_with_the_final_observation_and_the_memory_before_
     changes = {"env_id": "Endless-MortarMayhem-v0", "env_options": '{"max_steps": 5}', "seed": 3}
     args, run, *_ = played(bootstrap_truncated=True, **changes)
     rollout = run.rollout
-    assert rollout.truncated[4].all()
-    assert not rollout.terminated.any()
-    assert (rollout.truncation_values != 0).equal(rollout.truncated)
+    assert rollout.done[4].all()
+    assert (rollout.truncation_values != 0).equal(rollout.done)
     # The same actions played again: the final observation, and the memory that five steps left behind.
     state = run.agent.memory.begin_rollout(run.agent.memory.initial(4, torch.device("cpu")), 16)
     envs = envs_for(args, args.num_envs, seed=args.seed)
@@ -298,7 +297,7 @@ def test_a_step_that_terminated_its_episode_is_not_bootstrapped(tiny, opened, mo
 
     monkeypatch.setattr(run.envs, "step", terminate_too)
     collect(ppo_gru, run, args)
-    assert run.rollout.truncated[4].all()
+    assert run.rollout.done[4].all()
     assert (run.rollout.truncation_values[4] != 0).tolist() == [False, True]
 
 
@@ -425,7 +424,7 @@ REFRESHED = {
 )
 def test_refreshing_with_the_weights_that_acted_changes_nothing(played, ends, amp, memory):
     args, run, *_ = played(iterations=3, amp=amp, **REFRESHED[ends], **memory)
-    assert ends == "neither" or getattr(run.rollout, ends).any()
+    assert ends == "neither" or run.rollout.done.any()
     before = vars(run.rollout.memory_state)
     refreshed = memory.get("script", ppo_gru).refreshed_state(run.agent, run.rollout, args)
     for name, now in vars(refreshed).items():
@@ -467,7 +466,7 @@ def test_a_refreshed_state_is_that_of_a_rollout_with_the_present_weights(played,
         for t in range(args.num_steps):
             _, _, value = agent.get_action_and_value({name: part[t] for name, part in rollout.obs.items()}, state)
             wanted.append(value)
-            agent.memory.reset(state, rollout.terminated[t] | rollout.truncated[t])
+            agent.memory.reset(state, rollout.done[t])
     index, _, values = recompute(run)
     torch.testing.assert_close(values, torch.stack(wanted).flatten()[index], rtol=0, atol=1e-5)
 

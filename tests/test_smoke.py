@@ -291,7 +291,7 @@ def test_trains_on_the_levels_asked_for_from_the_first_episode_on(played):
     changes = {"env_id": "MortarMayhemB-Grid-v0", "num_levels": 3, "start_level": 10}
     seen = set(played(num_steps=1, num_minibatches=1, **changes)[1].envs.np_random_seed)
     _, run, *_ = played(**changes)
-    assert run.rollout.terminated.any()
+    assert run.rollout.done.any()
     assert seen | set(run.envs.np_random_seed) <= {10, 11, 12}
 
 
@@ -450,7 +450,7 @@ def test_logged_divergences(played):
     args, run, *_ = played(env_id="CueRecall-v0", clip_coef=0.1)
     rollout = run.rollout
     rollout.log_probs[..., 0] -= 0.2
-    pieces = run.agent.memory.cut(rollout.terminated)
+    pieces = run.agent.memory.cut(rollout.done)
     _, logs = ppo_gru.ppo_loss(run.agent, rollout, pieces, 0.0, args)
     assert logs["old_approx_kl"].item() == pytest.approx(-0.2, abs=1e-5)
     assert logs["approx_kl"].item() == pytest.approx(math.exp(0.2) - 1 - 0.2, abs=1e-5)

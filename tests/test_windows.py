@@ -394,7 +394,7 @@ def test_episodes_longer_than_a_learned_encoding(encoding):
     memory = make_memory(trxl_positional_encoding=encoding)
     if encoding == "learned":
         memory.table = torch.nn.Parameter(memory.table[:7].detach())
-    at = memory.position(torch.tensor([4, 5, 6, 7, 5000]), torch.zeros((), dtype=torch.float64))
+    at = memory.key_position(torch.tensor([4, 5, 6, 7, 5000]), torch.zeros((), dtype=torch.float64))
     assert np.shape(at) == ((5, WIDTH) if encoding in ("absolute", "learned") else ())
     if encoding == "learned":
         assert at.equal(memory.table[[4, 5, 6, 6, 6]])
@@ -410,7 +410,7 @@ def test_episodes_longer_than_a_learned_encoding(encoding):
 def test_steps_beyond_the_table_of_sinusoids_are_encoded_alike(step):
     memory = make_memory()
     for step_now in (step, step + 1):  # an episode goes on
-        at = memory.position(torch.tensor([step_now]), torch.zeros((), dtype=torch.float64))
+        at = memory.key_position(torch.tensor([step_now]), torch.zeros((), dtype=torch.float64))
         assert at.equal(sinusoid(torch.tensor([step_now]), WIDTH))
     assert "sinusoids" not in memory.state_dict()
 
