@@ -45,7 +45,11 @@ def main() -> int:
     check_bounds(args)
     torch.manual_seed(args.seed)
     with report_out_of_memory(args, torch.device("cpu")):
-        report = check(ScriptAdapter(script, args))
+        adapter = ScriptAdapter(script, args)
+        try:
+            report = check(adapter)
+        except ValueError as error:  # the memory's own: with its traceback, unlike those of the command line
+            raise AssertionError(f"{given.script} has an error") from error
     print(report)
     return bool(report.failed)
 

@@ -83,7 +83,7 @@ class Config:
     """draw to OUT.png and OUT.svg"""
     metrics: tuple[str, ...] = ()
     """what to show, e.g. return success (by default the family's own metric; of episodes that are played also return,
-    length and falls)"""
+    length and num_fails)"""
 
 
 def play(checkpoint: Checkpoint, config: Config) -> dict[str, np.ndarray]:
@@ -163,7 +163,8 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
     checkpoints = {path: Checkpoint.read(path, config.env_options) for path in dict.fromkeys(config.checkpoints)}
     arguments = {path: checkpoint.arguments() for path, checkpoint in checkpoints.items()}
     tasks = tasks_of(arguments, lambda args: title_of(args, config))
-    played = {path: play(each, config) for path, each in tqdm(checkpoints.items(), unit=" agents")}
+    with tqdm(checkpoints.items(), unit=" agents") as bar:  # closed before an error's line
+        played = {path: play(each, config) for path, each in bar}
     report = []
     for title, agents in tasks.items():
         paths = list(itertools.chain(*agents.values()))

@@ -110,8 +110,11 @@ def main(config: Config) -> None:
         raise ValueError("only agents of ppo_gru.py and ppo_trxl.py can be exported; write a step like theirs here")
     step = kind(player.agent).eval()
     obs = {name: torch.from_numpy(part) for name, part in player.envs.observation_space.sample().items()}
-    torch.export.save(torch.export.export(step, (obs, *step.beginning())), config.out)
-    print(f"wrote {config.out}")
+    state = step.beginning()
+    torch.export.save(torch.export.export(step, (obs, *state)), config.out)
+    parts = ", ".join(f"{name} {tuple(part.shape)}" for name, part in obs.items())
+    zeros = ", ".join(f"{tuple(part.shape)} of {part.dtype}" for part in state)
+    print(f"wrote {config.out}: from the parts {parts} and a state, at first zeros: {zeros}")
 
 
 if __name__ == "__main__":

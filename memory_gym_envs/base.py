@@ -249,7 +249,7 @@ class MemoryGymVectorEnv(Saved, VectorEnv):
 
     def longest_episode(self, lane: int) -> int:
         """The steps after which the lane's episode is over at the latest, under its reset options; -1: no limit."""
-        return self.settings[lane]["max_steps"]
+        return self.settings[lane].get("max_steps", -1)
 
     def annotate(self, frame: np.ndarray, lane: int) -> None:
         """Draws the lane's ground truth over its magnified frame, in place."""

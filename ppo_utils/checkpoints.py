@@ -133,6 +133,8 @@ def read_checkpoint(folder: str | Path) -> dict[str, Any]:
 
     Raises ValueError if it is not whole, OSError if there is none.
     """
+    if not os.path.isdir(folder):
+        raise OSError(f"--resume {folder}: there is no such folder; give a run's, runs/RUN")
     if not (found := checkpoints_in(folder)):
         raise OSError(f"--resume {folder}: there is no checkpoint-STEP.pt in this folder")
     try:
@@ -147,6 +149,8 @@ def read_model(path: str | Path) -> dict[str, Any]:
 
     Raises ValueError if it is not such a file, OSError if it cannot be read.
     """
+    if os.path.isdir(path):
+        raise OSError(f"{path} is a folder; give a file in it, as {Path(path) / 'model.pt'}")
     if not os.path.isfile(path):
         raise OSError(f"there is no file {path}; --save-model writes model.pt to the run folder")
     content = io.BytesIO(Path(path).read_bytes())

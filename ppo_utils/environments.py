@@ -60,7 +60,7 @@ def training_envs(args: RunArgs, checkpoint: dict[str, Any] | None) -> VectorEnv
     try:
         return envs_for(args, share, seed=seed, first_lane=rank * share, render_mode=mode)
     except ValueError as error:
-        if args.preset != "quickstart" or "option" not in str(error):
+        if args.preset != "quickstart" or args.env_id == RunArgs.env_id or "option" not in str(error):
             raise
         raise ValueError(
             f"{error}; --preset quickstart has options of its own, --env-options '{{}}' the default ones"

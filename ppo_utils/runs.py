@@ -299,8 +299,8 @@ def run_to_end(args: RunArgs, run: Run, train: Callable[[Any, Run], None]) -> Pa
     """Train until it is done or stopped; return the run folder.
 
     With --save-model, what was learned is kept, unless the training diverged, it needed too much memory, a file could
-    not be written or another process ended. Raises FloatingPointError and RunError as `train` does, then with the last
-    checkpoint's name, and KeyboardInterrupt after what was learned is kept.
+    not be written or another process ended. Raises FloatingPointError, RunError and LaneError as `train` does, then
+    with the last checkpoint's name, and KeyboardInterrupt after what was learned is kept.
     """
     save_model, interrupt = args.save_model, None
     try:
@@ -311,8 +311,8 @@ def run_to_end(args: RunArgs, run: Run, train: Callable[[Any, Run], None]) -> Pa
                 run.writer.flush()
     except KeyboardInterrupt as error:
         interrupt = error
-    except (FloatingPointError, RunError) as error:
-        save_model = False
+    except (FloatingPointError, RunError, LaneError) as error:
+        save_model = save_model and isinstance(error, LaneError)
         found = checkpoints_in(run.folder)
         last = f"the last checkpoint is {shown(found[-1], run.started_in)}" if found else "there is no checkpoint yet"
         raise type(error)(f"iteration {run.iteration}: {error}; {last}") from error
@@ -341,10 +341,15 @@ def summary(args: RunArgs, run: Run) -> str:
     folder = shlex.quote(shown(run.folder, run.started_in))
     # A wheel has these modules in this package, and the scripts at top level.
     installed = Path(__file__).with_name("evaluate.py").exists()
-    evaluate, enjoy = ("-m ppo_utils.evaluate", "-m ppo_utils.enjoy") if installed else ("evaluate.py", "enjoy.py")
-    script = f"-m {run.script}" if installed else f"{run.script}.py"
+    if installed:
+        evaluate, enjoy, script = "-m ppo_utils.evaluate", "-m ppo_utils.enjoy", f"-m {run.script}"
+    else:
+        root = Path(__file__).parents[1]
+        beside = [root / name for name in ("evaluate.py", "enjoy.py", f"{run.script}.py")]
+        shorter = [shown(path, run.started_in) if path.exists() else path.name for path in beside]
+        evaluate, enjoy, script = map(shlex.quote, shorter)
     lacking = not all(map(importlib.util.find_spec, ("PIL", "plotly")))  # which enjoy.py needs
-    extra = "memory-gym-baselines[eval]" if installed else '-e ".[eval]"'
+    extra = "memory-gym-baselines[eval]" if installed else f'-e "{shown(root, run.started_in)}[eval]"'
     install = f"pip install {extra} && " if lacking else ""
     lines = [f"{shown(run.folder, run.started_in)}: {run.step:,} steps, {score}"]
     checkpoints = checkpoints_in(run.folder)[-1:]

@@ -94,14 +94,17 @@ def test_an_observation_of_another_space(trained):
     (ppo_trxl, {"trxl_positional_encoding": "learned", "trxl_query_position": True}),
     (ppo_trxl, {"trxl_positional_encoding": "relative", "trxl_gate": "gru", "trxl_layer_norm": "post"}),
 ])  # fmt: skip
-def test_a_step_is_exported(trained, tmp_path, script, changes):
+def test_a_step_is_exported(trained, tmp_path, capsys, script, changes):
     """Over 20 steps of two episodes, a window of 7 included: the agent's own logits and values, to 1e-6."""
     path = str(trained(script, 1, env_id="MysteryPath-Grid-v0", value_init_gain=0.5, **changes))
     export_step.main(export_step.Config(path, str(tmp_path / "step.pt2")))
+    written = capsys.readouterr().out.splitlines()[-1]
     step = torch.export.load(tmp_path / "step.pt2").module()
     player = Player(path)
     agent = player.agent
     beginning = export_step.STEPS[type(agent)](agent).beginning()
+    assert all(f"{tuple(part.shape)} of {part.dtype}" in written for part in beginning)
+    assert all(f"{name} (1, " in written for name in player.envs.observation_space)
     state = beginning
     memory = agent.memory.begin_rollout(agent.memory.initial(1, torch.device("cpu")), 64)
     envs = envs_for(player.args, 1)

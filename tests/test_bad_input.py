@@ -62,6 +62,7 @@ CASES = {
     "--memory none --seq-len 5": "--seq-len, --num-layers and --refresh-memory need --memory gru or lstm",
     "--memory none --refresh-memory": "--refresh-memory need --memory gru or lstm",
     "--preset quickstart --env-id MysteryPath-Grid-v0": "no option .*quickstart has options .*'{}' the default",
+    '--preset quickstart --env-options {"comand_count":[4]}': "no option 'comand_count'(?!.*quickstart)",
     "--preset quickstart --env-id CartPole-v1": "CartPole-v1 has none .*quickstart has options of its own",
     "--preset quickstart --env-id MortarMayhm-v0": "the nearest is MortarMayhem-v0$",
     "--env-id .foo:x-v0": "the module of .foo:x-v0 begins with a dot",

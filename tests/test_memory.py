@@ -119,6 +119,8 @@ def test_nothing_leaks_and_nothing_is_lost(tiny, memory):
     args = tiny(**memory)
     report = check(ScriptAdapter(memory.get("script", ppo_gru), args))
     assert not report.failed, str(report)
+    if memory.get("script") in OTHERS:
+        return  # how far the gradient reaches is that memory's own matter
     if hasattr(args, "trxl_segment_length"):
         reach = min(args.trxl_segment_length, STEPS) - 1 if args.trxl_memory_gradient else 0
     else:
@@ -154,7 +156,9 @@ def test_padding_changes_nothing(played, memory, fill, monkeypatch):
 
     def learn():
         pieces = run.agent.memory.cut(rollout.done)
-        assert pieces.length.min() < pieces.length.max(), "there is padding"
+        if pieces.length.min() == pieces.length.max():
+            assert script in OTHERS, "there is padding"
+            pytest.skip("its pieces have one length")
         run.agent.zero_grad()
         loss, _ = script.ppo_loss(run.agent, rollout, pieces, 1e-3, args)
         loss.backward()
@@ -428,9 +432,9 @@ def test_refreshing_with_the_weights_that_acted_changes_nothing(played, ends, am
     before = vars(run.rollout.memory_state)
     refreshed = memory.get("script", ppo_gru).refreshed_state(run.agent, run.rollout, args)
     for name, now in vars(refreshed).items():
-        same = [each.equal(other) for each, other in zip(now, before[name], strict=True)] if name != "now" else [True]
+        leaves = zip(tree_leaves(now), tree_leaves(before[name]), strict=True)
+        same = [each.equal(other) if torch.is_tensor(each) else each == other for each, other in leaves]
         assert all(same), f"{name}: does carry hold all that a rollout begins with?"
-    assert refreshed.now == before["now"]
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
@@ -444,7 +448,8 @@ def test_the_next_rollout_goes_on_with_the_refreshed_state(tiny, opened, script,
     script.train(args, run)
     for name, part in run.agent.memory.carry(refreshed[-1]).items():
         assert run.carry.memory[name].equal(part)
-    assert not torch.equal(refreshed[0].hidden, refreshed[1].hidden)
+    one, other = (run.agent.memory.carry(state) for state in refreshed[:2])
+    assert any(not part.equal(other[name]) for name, part in one.items())
 
 
 @each_memory(WITH_MEMORY)

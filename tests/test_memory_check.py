@@ -482,6 +482,14 @@ def test_the_program_checks_the_script_that_is_named(tmp_path, monkeypatch, name
         check_memory.main()
 
 
+def test_what_a_memory_raises_keeps_its_traceback(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["check_memory.py", f"{ROOT}/ppo_gru.py"])
+    monkeypatch.setattr(check_memory, "check", lambda adapter: int("torn"))
+    with pytest.raises(AssertionError, match=r"ppo_gru\.py has an error$") as raised:
+        check_memory.main()
+    assert isinstance(raised.value.__cause__, ValueError)
+
+
 # ---- probes ----
 
 

@@ -864,6 +864,17 @@ def test_where_a_reset_raised(seed, where):
         lane.reset(seed=seed)
 
 
+@pytest.mark.parametrize(("interval", "last"), [(0, "there is no checkpoint yet"), (1, r"runs/.*/checkpoint-64\.pt")])
+def test_an_environment_that_raises_while_it_is_trained_in(tiny, interval, last):
+    """In the second iteration: what was learned is kept, and its error names the last checkpoint."""
+    broken = small(length=30, see=lambda env: np.full(1, 1 / (20 - env.t), np.float32))
+    args = tiny(env_id=broken, save_model=True, checkpoint_interval=interval)
+    says = r"^iteration 2: environment \d raised ZeroDivisionError in step .*: division by zero; "
+    with pytest.raises(LaneError, match=f"{says}.*{last}$"):
+        ppo_gru.main(args)
+    assert [*Path("runs").glob("*/model.pt")]
+
+
 class Unclosable(Small):
     def close(self):
         raise KeyError("no sim")

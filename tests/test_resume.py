@@ -32,6 +32,8 @@ from ppo_utils.checkpoints import model_of, read_checkpoint, read_model, write_f
 from ppo_utils.errors import RunError
 from ppo_utils.run_logs import read_run
 
+ROOT = Path(__file__).parents[1]
+
 GRID = {"env_id": "MortarMayhemB-Grid-v0", "obs_type": "vector"}
 ENDLESS = {"env_id": "Endless-SearingSpotlights-v0", "obs_type": "vector"}
 PIXELS = {"num_steps": 8, "update_epochs": 1}  # of pictures fewer, since each takes long
@@ -282,7 +284,7 @@ def test_an_environment_that_changes_the_folder(tiny, tmp_path, monkeypatch, cap
     (folder,) = {ppo_gru.main(args)}
     assert folder.parent == tmp_path / "runs"
     assert {"model.pt", "checkpoint-64.pt", "checkpoint-128.pt"} < {*os.listdir(folder)}
-    assert f"evaluate: python evaluate.py runs/{folder.name}/model.pt" in capsys.readouterr().out
+    assert f"evaluate: python {ROOT}/evaluate.py runs/{folder.name}/model.pt" in capsys.readouterr().out
     for flags in (
         {"resume": f"runs/{folder.name}", "total_timesteps": 192},
         {"load_model": f"runs/{folder.name}/model.pt"},
@@ -476,8 +478,12 @@ def test_a_checkpoint_that_is_cut_short(trained, tmp_path):
 
 
 def test_a_folder_without_a_checkpoint(tmp_path):
-    with pytest.raises(OSError, match=r"--resume nowhere: there is no checkpoint-STEP\.pt in this folder"):
+    with pytest.raises(OSError, match=r"--resume nowhere: there is no such folder; give a run's, runs/RUN"):
         parse_args(ppo_gru, "--resume", "nowhere")
+    with pytest.raises(OSError, match=rf"--resume {tmp_path}: there is no checkpoint-STEP\.pt in this folder"):
+        parse_args(ppo_gru, "--resume", str(tmp_path))
+    with pytest.raises(OSError, match=rf"^{tmp_path} is a folder; give a file in it, as {tmp_path}/model\.pt"):
+        read_model(tmp_path)
 
 
 def test_a_folder_that_cannot_be_written(trained, monkeypatch):

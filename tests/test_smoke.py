@@ -13,6 +13,7 @@ import traceback
 import types
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -28,6 +29,7 @@ from ppo_utils import logs, runs
 from ppo_utils.checkpoints import read_model, saved_args
 from ppo_utils.flags import check_args, flag
 
+ROOT = Path(__file__).parents[1]
 MEMORIES = [
     *({"memory": memory} for memory in ("gru", "lstm", "none")),
     {"script": ppo_trxl},
@@ -548,8 +550,8 @@ def test_the_last_lines(tiny, capsys, monkeypatch):
     assert re.fullmatch(rf"{folder}: 256 steps, return -?\d\.\d\d, mean of the last \d+ episodes", score)
     checkpoint = folder / "checkpoint-256.pt"
     assert commands == [
-        f"evaluate: python evaluate.py {checkpoint}",
-        f"watch: python enjoy.py {checkpoint} --out page.html",
+        f"evaluate: python {ROOT}/evaluate.py {checkpoint}",
+        f"watch: python {ROOT}/enjoy.py {checkpoint} --out page.html",
         f"plot: tensorboard --logdir {folder}",
     ]
     find_spec = runs.importlib.util.find_spec
@@ -558,12 +560,21 @@ def test_the_last_lines(tiny, capsys, monkeypatch):
     folder = folder.relative_to(os.getcwd())
     score, *commands = capsys.readouterr().out.splitlines()
     assert re.fullmatch(rf"{folder}: 256 steps, return -?\d\.\d\d on 2 other levels", score)
-    assert commands[0] == f"evaluate: python evaluate.py {folder / 'model.pt'}"
-    assert commands[1].startswith('watch: pip install -e ".[eval]" && python enjoy.py')
+    assert commands[0] == f"evaluate: python {ROOT}/evaluate.py {folder / 'model.pt'}"
+    assert commands[1].startswith(f'watch: pip install -e "{ROOT}[eval]" && python {ROOT}/enjoy.py')
     args = tiny(env_id="MysteryPath-v0", obs_type="vector", checkpoint_interval=0, exp_name="c d")
     folder = ppo_gru.main(args).relative_to(os.getcwd())
     told = [f"{folder}: 128 steps, no episode ended", f"plot: tensorboard --logdir '{folder}'"]
     assert capsys.readouterr().out.splitlines() == told
+
+
+def test_commands_are_short_in_the_repository(tiny, opened):
+    args = tiny(env_id="CueRecall-v0", total_timesteps=64)
+    run = opened(ppo_gru, args)
+    ppo_gru.train(args, run)
+    run.started_in, run.stop = ROOT, True
+    programs = [line.split()[2] for line in runs.summary(args, run).splitlines()[1:3]]
+    assert programs == ["ppo_gru.py", "evaluate.py"]
 
 
 def test_the_last_lines_of_a_run_that_was_stopped(tiny, opened, capsys):
@@ -574,8 +585,8 @@ def test_the_last_lines_of_a_run_that_was_stopped(tiny, opened, capsys):
     told = capsys.readouterr().out.splitlines()
     folder = run.folder.relative_to(os.getcwd())
     assert told[1:] == [
-        f"resume: python ppo_gru.py --resume {folder}",
-        f"evaluate: python evaluate.py {folder / 'checkpoint-64.pt'}",  # this environment draws nothing to watch
+        f"resume: python {ROOT}/ppo_gru.py --resume {folder}",
+        f"evaluate: python {ROOT}/evaluate.py {folder / 'checkpoint-64.pt'}",  # this environment draws nothing to watch
         f"plot: tensorboard --logdir {folder}",
     ]
 

@@ -71,6 +71,7 @@ def test_levels_and_debug_view():
 def test_scripts_can_train_on_it():
     """With levels, reset options and vectors, as on those of the package."""
     assert is_memory_gym("examples.recall:Recall-v0")
+    assert gym.make("Recall-v0").unwrapped.max_episode_steps == -1, "it does not say"
     envs = make_envs("examples.recall:Recall-v0", 3, seed=1, obs_type="vector", num_levels=5, options=OPTIONS)
     observations, _ = envs.reset()
     assert observations["observation"].shape == (3, 3)
