@@ -11,6 +11,7 @@ import signal
 import sys
 import threading
 import types
+from pathlib import Path
 
 import gymnasium as gym
 import imageio_ffmpeg
