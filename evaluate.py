@@ -158,7 +158,7 @@ def choose_metrics(wanted: tuple[str, ...], env_id: str, played: list[dict[str, 
 def score_checkpoints(config: Config) -> list[dict[str, Any]]:
     """Play the levels with every checkpoint's agent; print a table for each task, and return what is in it.
 
-    A task that does not report the wanted metrics gets a line instead. Raises ValueError if none does.
+    A task that does not report the wanted metrics gets a line, and its usual ones.
     """
     checkpoints = {path: Checkpoint.read(path, config.env_options) for path in dict.fromkeys(config.checkpoints)}
     arguments = {path: checkpoint.arguments() for path, checkpoint in checkpoints.items()}
@@ -168,13 +168,12 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
     report = []
     for title, agents in tasks.items():
         paths = list(itertools.chain(*agents.values()))
+        env_id, numbers = arguments[paths[0]]["env_id"], [played[path] for path in paths]
         try:
-            metrics = choose_metrics(config.metrics, arguments[paths[0]]["env_id"], [played[path] for path in paths])
-        except ValueError as error:
-            if len(tasks) == 1:
-                raise
+            metrics = choose_metrics(config.metrics, env_id, numbers)
+        except ValueError as error:  # what was played is not thrown away
             print(f"{title}: {error}", file=sys.stderr)
-            continue
+            metrics = choose_metrics((), env_id, numbers)
         summaries = []
         for label, members in agents.items():
             scores = {name: np.stack([played[path][name] for path in members]) for name in metrics}  # (R, M, E) each
@@ -189,8 +188,6 @@ def score_checkpoints(config: Config) -> list[dict[str, Any]]:
             if told := trained_levels(training, config):
                 whose = f"Trained on {count} levels from {first} on: " if len(trainings) > 1 else ""
                 print(f"{whose}{told}\n")
-    if not report:
-        raise ValueError(f"no task reports {', '.join(config.metrics)}")
     return report
 
 
@@ -230,6 +227,9 @@ def main(config: Config) -> None:
         report = score_checkpoints(config)
     if config.json is not None:
         Path(config.json).write_text(json.dumps(report, indent=1))
+    agents = [agent for task in report for agent in task["agents"]] if config.checkpoints else []
+    if agents and not any({*config.metrics} <= {*agent["metrics"]} for agent in agents):
+        raise ValueError(f"no task reports {', '.join(config.metrics)}")
 
 
 if __name__ == "__main__":

@@ -864,17 +864,20 @@ def test_metrics_that_every_episode_reported():
 
 
 def test_a_metric_that_one_of_two_tasks_has(tiny, capsys):
-    """The other one gets a line, and what was played is kept."""
+    """The other one gets a line and its usual metrics; what was played is kept, also if none has it."""
     paths = []
     for env_id in ("MysteryPath-Grid-v0", "MortarMayhemB-Grid-v0"):
         paths.append(str(ppo_gru.main(tiny(env_id=env_id, obs_type="vector", save_model=True)) / "model.pt"))
     few = {"levels": 1, "repeats": 1, "cuda": False}
     evaluate.main(evaluate.Config(tuple(paths), metrics=("carried_out",), json="scores.json", **few))
-    (task,) = json.loads(Path("scores.json").read_text())
+    other, task = json.loads(Path("scores.json").read_text())
     assert task["task"].startswith("MortarMayhemB-Grid-v0")
+    assert list(task["agents"][0]["metrics"]) == ["carried_out"]
+    assert list(other["agents"][0]["metrics"])[:2] == ["success", "return"]
     assert "MysteryPath-Grid-v0, levels 100000 to 100000, 1 times each: not every" in capsys.readouterr().err
     with pytest.raises(ValueError, match="no task reports coins"):
-        evaluate.main(evaluate.Config(tuple(paths), metrics=("coins",), **few))
+        evaluate.main(evaluate.Config(tuple(paths), metrics=("coins",), json="others.json", **few))
+    assert len(json.loads(Path("others.json").read_text())) == 2
 
 
 # ---- bad input ----
@@ -892,7 +895,7 @@ BAD = {
     "MODEL --json no/where.json": "there is no folder no to write to",
     "MODEL --json empty": "--json empty is a folder; give a file to write to",
     "MODEL --json ''": "--json  is a folder; give a file to write to",
-    "MODEL --metrics coins": "not every episode reported coins; all reported return, length, reward",
+    "MODEL --metrics coins": "no task reports coins",
     "--curves nowhere": "there is no run folder nowhere",
     "--curves empty": "empty holds no curves",
     "--curves results": "results is a folder of results; give the files themselves, as results/\\*.json.gz",
