@@ -25,7 +25,7 @@ OPTIONS = (
     Option("reward_success", 1.0, "float", None, None, "reward for the right answer"),
 )
 ENTRIES = (Entries("color", BLANK, "the color that is shown, one-hot: red, green, blue; zeros: none"),)
-VARIANTS = {"Recall-v0": Variant(4, OPTIONS, ENTRIES)}  # the ids; 4 frames a second when it is played
+VARIANTS = {"Recall-v0": Variant(4, OPTIONS, ENTRIES)}  # the ids; 4 frames a second in videos
 
 
 @dataclass
