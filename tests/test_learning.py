@@ -129,7 +129,7 @@ def test_agents_to_draw_and_names_are_checked():
 
 
 def test_an_agent_goes_on_with_no_other_run(tmp_path):
-    with pytest.raises(SystemExit, match="GRU --resume nowhere: --resume nowhere: there is no checkpoint"):
+    with pytest.raises(SystemExit, match="GRU --resume nowhere: --resume nowhere: there is no such folder"):
         learning.plan(learning.Config(), learning.TASKS["mortar-mayhem"], "GRU --resume nowhere", 1)
 
 
