@@ -48,7 +48,7 @@ def main() -> int:
         adapter = ScriptAdapter(script, args)
         try:
             report = check(adapter)
-        except ValueError as error:  # the memory's own: with its traceback, unlike those of the command line
+        except (ValueError, OSError, ImportError) as error:  # the memory's own: with its traceback
             raise AssertionError(f"{given.script} has an error") from error
     print(report)
     return bool(report.failed)

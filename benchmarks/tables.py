@@ -28,7 +28,7 @@ BOUNDS, THESIS, NEW_LEVELS = (Path(__file__).with_name(f"{name}.csv") for name i
 ALPHA = 0.05  # significance level: agents differ if the p-value is below it
 SHOWN = ("show_origin", "show_goal")  # options that change how a level looks, not what it is
 RIVALS = ("no memory", "GRU")  # with which the others are compared over all tasks
-DIFFER_FROM = ("GRU", "16 frames")  # with which they are compared with all tasks tested at once
+DIFFER_FROM = ("GRU", "16 frames")  # whom the others are compared with, all tasks tested at once
 NAMES_APART = 0.075  # between the names beside the curves' ends, as a share of the axis
 
 

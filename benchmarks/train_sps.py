@@ -29,10 +29,10 @@ from typing import Any, Literal
 import gymnasium as gym
 import torch
 import tyro
-from torch.nn.utils.rnn import pad_sequence
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this clone, before an installed one
 
+import ppo_gru
 from ppo_utils.errors import RunError
 from ppo_utils.flags import PositiveInt, check_bounds
 from ppo_utils.runs import close, parse_args
@@ -63,9 +63,8 @@ class Config:
 
 def padded_gru(rnn: torch.nn.GRU, x: torch.Tensor, lengths: torch.Tensor, hidden: torch.Tensor) -> torch.Tensor:
     """Compute what `packed_gru` does with the library's GRU, over padded sequences."""
-    padded = pad_sequence(x.split(lengths.tolist()), batch_first=True)
-    y, _ = rnn(padded, hidden.transpose(0, 1).contiguous())
-    return torch.cat([sequence[:length] for sequence, length in zip(y, lengths.tolist(), strict=True)])
+    pieces = ppo_gru.Pieces(torch.zeros_like(lengths), lengths, 1)
+    return pieces.unpad(rnn(pieces.pad(x), hidden.transpose(0, 1).contiguous())[0])
 
 
 PLAIN = {  # what each fast path replaces
@@ -111,6 +110,8 @@ def measure(config: Config, num_steps: int) -> tuple[dict[str, float], float, in
     """Return the steps/s of the script and of both bounds, the share of distinct pictures, and the best piece."""
     script = importlib.import_module(config.script)
     for name in config.without:
+        if not hasattr(script, name):
+            raise ValueError(f"{config.script} has no {name}; leave it out of --without")
         setattr(script, name, PLAIN[name])
     flags = f"--env-id {config.env_id} --num-envs {config.num_envs} --num-steps {num_steps} {config.flags}"
     args = parse_args(script.Args, script.PRESETS, flags.split())

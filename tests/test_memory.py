@@ -14,6 +14,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 import ppo_gru
 import ppo_trxl
+import train_sps
 from ppo_utils import fast
 from ppo_utils.environments import envs_for
 from ppo_utils.memory_adapters import ScriptAdapter
@@ -135,12 +136,6 @@ def test_bootstrap_value_is_the_next_step_s_value(played, memory):
     torch.testing.assert_close(run.rollout.values[0], last_value, atol=1e-6, rtol=0)
 
 
-def padded_gru(rnn, x, lengths, hidden):
-    """What `packed_gru` replaces: the sequences padded, as on a GPU."""
-    pieces = ppo_gru.Pieces(torch.zeros_like(lengths), lengths, 1)
-    return pieces.unpad(rnn(pieces.pad(x), hidden.transpose(0, 1).contiguous())[0])
-
-
 def gradients(agent):
     return torch.cat([parameter.grad.flatten() for parameter in agent.parameters() if parameter.grad is not None])
 
@@ -150,7 +145,7 @@ def gradients(agent):
 def test_padding_changes_nothing(played, memory, fill, monkeypatch):
     script = memory.get("script", ppo_gru)
     args, run, *_ = played(iterations=2, env_id="CueRecall-v0", **memory)
-    monkeypatch.setattr(script, "packed_gru", padded_gru, raising=False)
+    monkeypatch.setattr(script, "packed_gru", train_sps.padded_gru, raising=False)
     rollout = run.rollout
     rollout.advantages, rollout.returns = rollout.rewards - rollout.values, rollout.rewards
 
@@ -195,7 +190,7 @@ def test_the_encoder_sees_each_step_once_an_epoch_and_no_padding(played, monkeyp
     args, run, *_ = played(env_id="CueRecall-v0")
     rows, runs = [], []
     run.agent.encoder.register_forward_pre_hook(lambda _, inputs: rows.append(len(inputs[0]["observation"])))
-    unroll = ppo_gru.packed_gru if packed else padded_gru
+    unroll = ppo_gru.packed_gru if packed else train_sps.padded_gru
     monkeypatch.setattr(ppo_gru, "packed_gru", lambda *given: (runs.append(1), unroll(*given))[1])
     ppo_gru.update(run.agent, run.optimizers, run.rollout, 0.0, args)
     assert sum(rows) == args.update_epochs * args.num_envs * args.num_steps
@@ -360,7 +355,7 @@ def test_the_packed_gru_learns_as_the_library_s(layers):
 def test_packed_or_padded_is_the_same(played, monkeypatch):
     _, run, *_ = played(iterations=2, env_id="CueRecall-v0", num_layers=2)
     packed = recompute(run)
-    monkeypatch.setattr(ppo_gru, "packed_gru", padded_gru)
+    monkeypatch.setattr(ppo_gru, "packed_gru", train_sps.padded_gru)
     for got, want in zip(packed, recompute(run), strict=True):
         torch.testing.assert_close(got, want, rtol=0, atol=1e-6)
 

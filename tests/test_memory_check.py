@@ -482,12 +482,16 @@ def test_the_program_checks_the_script_that_is_named(tmp_path, monkeypatch, name
         check_memory.main()
 
 
-def test_what_a_memory_raises_keeps_its_traceback(monkeypatch):
+@pytest.mark.parametrize("error", [ValueError, OSError, ImportError])
+def test_what_a_memory_raises_keeps_its_traceback(monkeypatch, error):
+    def torn(adapter):
+        raise error("torn")
+
     monkeypatch.setattr("sys.argv", ["check_memory.py", f"{ROOT}/ppo_gru.py"])
-    monkeypatch.setattr(check_memory, "check", lambda adapter: int("torn"))
+    monkeypatch.setattr(check_memory, "check", torn)
     with pytest.raises(AssertionError, match=r"ppo_gru\.py has an error$") as raised:
         check_memory.main()
-    assert isinstance(raised.value.__cause__, ValueError)
+    assert isinstance(raised.value.__cause__, error)
 
 
 # ---- probes ----

@@ -22,7 +22,7 @@ def test_parameter_count_of_the_gru_agent_on_endless_mystery_path():
 
 
 def test_parameter_counts_of_the_transformers():
-    """Thesis 6.1.1 has 2.8 million, as its author's code shares projections among heads, and 9.4 with gates."""
+    """Thesis 6.1.1 has 2.8 million, mostly since its author's code shares projections among heads; 9.4 with gates."""
     agents = [ppo_trxl.Agent(PIXELS, [4], ppo_trxl.Args(trxl_gate=gate)) for gate in ("none", "gru")]
     assert [sum(p.numel() for p in agent.parameters()) for agent in agents] == [4_226_597, 9_537_317]
 

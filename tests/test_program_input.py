@@ -29,6 +29,7 @@ FULL = "--suite full --report --agents GRU"
         ("benchmarks/train_sps.py --chunks 0", "--chunks is 0; give sizes of 1 frame or more"),
         ("benchmarks/train_sps.py --chunks", "--chunks is empty; give sizes of 1 frame or more"),
         ("benchmarks/train_sps.py --env-id CartPole-v1", "choose an environment and flags with images"),
+        ("benchmarks/train_sps.py --script ppo_trxl --without packed_gru", "ppo_trxl has no packed_gru; leave it out"),
         ("benchmarks/trxl_cost.py --windows 0", "--trxl-memory-length is 0; it must be 1 or more"),
         (f"check_memory.py {ROOT}/ppo_gru.py --trunk-size 9999999999", "does not fit in the memory of cpu"),
         ("check_memory.py ppo_bare.py", "the script ppo_bare.py has no Args; give one such as ppo_gru.py"),

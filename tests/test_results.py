@@ -21,6 +21,7 @@ import ppo_gru
 import ppo_trxl
 import seeds
 import speedrun
+import suites
 import tables
 import trained_paths
 import trials
@@ -139,6 +140,17 @@ def test_every_number_of_the_page_of_tuning_is_printed(tmp_path, monkeypatch, ca
 def test_the_table_of_fewest_steps_is_printed_by_its_command(capsys):
     speedrun.main()
     assert capsys.readouterr().out in (ROOT / "docs/results.md").read_text()
+
+
+def test_in_which_tasks_gru_and_transformer_differ(tmp_path, capsys):
+    """As the page of results says: in all but two."""
+    config = learning.Config(suite="full", seeds=(1, 2, 3, 4, 5), agents=("GRU", "TrXL+"), report=True)
+    learning.main(replace(config, results=ROOT / "benchmarks/results", out=tmp_path / "curves.png"))
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("TrXL+ and GRU differ, "))
+    others = {*suites.FULL} - {*line.partition(" in ")[2].split(", ")}
+    assert others == {"MysteryPath-v0", "SearingSpotlights-v0"}
+    page = (ROOT / "docs/results.md").read_text()
+    assert "differ in all but Mystery Path and Searing Spotlights" in " ".join(page.split())
 
 
 def test_trials_are_printed_and_added(tiny, tmp_path, monkeypatch, capsys):
