@@ -3,8 +3,9 @@
     python benchmarks/seeds.py
 
 docs/seeds.png has a panel for each task and a dot for each seed: the score of the final weights on new test levels.
-docs/endless.png has the curves of endless tasks on development levels, with steps on a logarithmic axis up to the
-thesis', docs/commands.png after how many commands episodes of Endless Mortar Mayhem end, which a table says, too.
+The dots of seeds that chose nothing are open. docs/endless.png has the curves of endless tasks on development levels,
+with steps on a logarithmic axis up to the thesis', docs/commands.png after how many commands episodes of Endless Mortar
+Mayhem end, which a table says, too.
 """
 
 import sys
@@ -20,7 +21,7 @@ import learning
 import tables
 from ppo_utils.run_logs import Runs, align
 from ppo_utils.terminal import one_line_exit
-from suites import COLORS, LONGER, TASKS
+from suites import CHOOSING_SEEDS, COLORS, LONGER, SEEDS, TASKS
 
 AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, before", "TrXL+")
 LONG_AGENTS = ("GRU", "GRU --num-envs 32 --num-steps 512", "TrXL+, before", "TrXL+")  # of the last picture
@@ -35,8 +36,17 @@ def draw_seeds(results: dict[str, Runs], out: Path) -> None:
         task = TASKS[env_id]
         theirs = thesis.get(env_id, {})
         for column, (agent, runs) in enumerate(agents.items()):
-            scores = tables.final_scores(task.score, runs).mean((1, 2)).tolist() if runs else []
-            axis.plot([column] * len(scores), scores, "o", color=COLORS[agent], alpha=0.6)
+            for chose, fill in ((True, COLORS[agent]), (False, "none")):
+                dots = [run for run in runs if (int(run.args["seed"]) in CHOOSING_SEEDS) == chose]
+                scores = [float(tables.final_scores(task.score, [run]).mean()) for run in dots]
+                axis.plot(
+                    [column + (-0.12 if chose else 0.12)] * len(dots),
+                    scores,
+                    "o",
+                    color=COLORS[agent],
+                    markerfacecolor=fill,
+                    alpha=0.6,
+                )
             if level := theirs.get(agent.removesuffix("+")):
                 axis.plot(column, float(level.removeprefix("> ")), "k_", markersize=28, label="thesis")
         axis.axhline(bounds[env_id].random, color="gray", linestyle=":", label="random actions")
@@ -47,8 +57,10 @@ def draw_seeds(results: dict[str, Runs], out: Path) -> None:
         axis.set_xlim(-0.5, len(AGENTS) - 0.5)
         axis.set_title(f"{env_id.removesuffix('-v0')}, {task.total_timesteps / 1e6:g} M", fontsize=9)
         axis.set_ylabel(task.score, fontsize=8)
+    for fill, which in (("k", "settings were chosen by it"), ("none", "it chose nothing")):
+        figure.axes[0].plot([], [], "ko", markerfacecolor=fill, label=f"a seed; {which}")
     handles = dict(zip(*reversed(figure.axes[0].get_legend_handles_labels()), strict=True))
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=3, frameon=False)
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=5, frameon=False)
     figure.savefig(out, dpi=110)
 
 
@@ -110,7 +122,7 @@ def draw_commands(out: Path) -> None:
 
 def main(folder: Path = Path("docs")) -> None:
     """Draw the pictures to a folder, and print the table."""
-    results = learning.stored_results(suite="full", agents=AGENTS)
+    results = learning.stored_results(suite="full", agents=AGENTS, seeds=SEEDS)
     draw_seeds(results, folder / "seeds.png")
     draw_endless(with_longer(results), folder / "endless.png")
     draw_commands(folder / "commands.png")

@@ -22,10 +22,9 @@ import learning
 import tables
 from ppo_utils.run_logs import RunLog
 from ppo_utils.terminal import one_line_exit
-from suites import TASKS
+from suites import SEEDS, TASKS
 
 ENTRIES = Path(__file__).with_name("speedrun.csv")
-SEEDS = (1, 2, 3, 4, 5)
 ALPHA = 0.01  # significance level of the test that the mean is above the target
 SMALLEST_PRINTED = 0.0001  # p-value
 HEADING = """| task | target | agent | score | p <= | steps | date, commit |

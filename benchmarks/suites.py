@@ -108,6 +108,8 @@ SUITES = {  # tasks and agents
     "small": (SMALL, ("no memory", "4 frames", "16 frames", "GRU", "TrXL", "TrXL+")),
     "full": (FULL, ("no memory", "16 frames", "GRU", "TrXL+")),
 }
+SEEDS = (1, 2, 3, 4, 5)  # of the tables, where an agent has them all
+CHOOSING_SEEDS = SEEDS[:3]  # by which settings were chosen
 COLORS = {  # an agent has the same in every picture
     "no memory": "tab:gray",
     "4 frames": "tab:olive",

@@ -235,20 +235,26 @@ def overview(tasks: dict[str, Runs], bounds: dict[str, Bounds], thesis: dict[str
     """Return a table with a row for each task: the mean score of each agent's final weights, and its standard error.
 
     Beside it stand the scores of random actions, of the scripted player and in the thesis, the steps of a training, and
-    the minutes of the fastest and of the slowest agent. Where an agent has fewer seeds than others, it says how many;
-    where it has none, there is no number.
+    the minutes of the fastest and of the slowest agent. An agent's heading has its number of seeds, if others have
+    another one, and so has a cell with fewer; where there is none, there is no number.
     """
     names = [*dict.fromkeys(agent for agents in tasks.values() for agent in agents)]
-    most = max(len(runs) for agents in tasks.values() for runs in agents.values())
+    seeds = {name: max(len(agents.get(name, [])) for agents in tasks.values()) for name in names}
 
-    def cell(task: Task, runs: list[RunLog]) -> str:
+    def count(runs: int) -> str:
+        return f"{runs} seed{'s' * (runs > 1)}"
+
+    def cell(agent: str, task: Task, runs: list[RunLog]) -> str:
         if not runs:
             return ""
-        few = f", {len(runs)} seed{'s' * (len(runs) > 1)}" if len(runs) < most else ""
+        few = f", {count(len(runs))}" if len(runs) < seeds[agent] else ""
         return mean_and_error(final_scores(task.score, runs)) + few
 
+    same = len(set(seeds.values())) == 1
+    headings = [name if same else f"{name} ({count(seeds[name])})" for name in names]
+
     theirs = ["thesis: GRU, TrXL"] if tasks.keys() & thesis.keys() else []
-    header = ["task, score", "steps", "random", *names, "scripted", *theirs, "minutes"]
+    header = ["task, score", "steps", "random", *headings, "scripted", *theirs, "minutes"]
     lines = [f"| {' | '.join(header)} |", f"|---|{'---:|' * (len(header) - 1)}"]
     for name, agents in tasks.items():
         first = next(runs[0] for runs in agents.values() if runs)
@@ -258,7 +264,7 @@ def overview(tasks: dict[str, Runs], bounds: dict[str, Bounds], thesis: dict[str
             f"{name}, {TASKS[name].score}",
             f"{int(first.args['total_timesteps']) / 1e6:.4g} M",
             f"{known.random:.2f}" if known else "",
-            *(cell(TASKS[name], agents.get(agent, [])) for agent in names),
+            *(cell(agent, TASKS[name], agents.get(agent, [])) for agent in names),
             f"{known.scripted:.2f}" if known else "",
             *[", ".join(thesis[name][agent] for agent in ("GRU", "TrXL")) if name in thesis else "" for _ in theirs],
             " to ".join(dict.fromkeys(f"{each:.0f}" for each in (min(minutes), max(minutes)))),

@@ -27,7 +27,7 @@ import tables
 from ppo_utils.evaluation import beginnings
 from ppo_utils.flags import RunArgs
 from ppo_utils.terminal import one_line_exit
-from suites import COLORS, LONGER, TASKS
+from suites import COLORS, LONGER, SEEDS, TASKS
 
 AGENTS = ("no memory", "16 frames", "GRU", "TrXL+, low rate", "TrXL+")
 PATH_TASKS = ("MysteryPath-Grid-v0", "MysteryPath-v0")  # tasks that have the same paths
@@ -96,7 +96,7 @@ def print_scores(out: Path) -> None:
     columns = ["0", "1", "2-4", "5-10", "11-30", "31-100", "more"]
     times = times_trained_on(ppo_gru.Args(env_id=PATH_TASKS[0]), TEST_LEVELS)
     inside = [(low <= times) & (times < high) for low, high in pairwise(EDGES)]
-    results = learning.stored_results(tasks=PATH_TASKS, agents=AGENTS)
+    results = learning.stored_results(tasks=PATH_TASKS, agents=AGENTS, seeds=SEEDS)
     longer = learning.stored_results(tasks=(LONG_TASK,), steps=LONGER[LONG_TASK], agents=("TrXL+",))
     results[LONG_TASK][f"TrXL+, {LONGER[LONG_TASK] / 1e6:g} M"] = longer[LONG_TASK]["TrXL+"]
     for axis, (env_id, agents) in zip(figure.subplots(1, 2, sharey=True), results.items(), strict=True):

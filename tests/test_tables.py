@@ -119,9 +119,9 @@ def test_an_overview_says_where_seeds_or_agents_are_missing():
     bounds = {"SearingSpotlights-v0": tables.Bounds(0.01, 0.9)}
     thesis = {"Endless-MortarMayhem-v0": {"GRU": "120", "TrXL": "18"}}
     assert tables.overview(tasks, bounds, thesis).splitlines() == [
-        "| task, score | steps | random | GRU | LSTM | scripted | thesis: GRU, TrXL | minutes |",
+        "| task, score | steps | random | GRU (3 seeds) | LSTM (1 seed) | scripted | thesis: GRU, TrXL | minutes |",
         "|---|---:|---:|---:|---:|---:|---:|---:|",
-        "| SearingSpotlights-v0, success | 0.0003 M | 0.01 | 0.25 ± 0.00 | 0.25, 1 seed | 0.90 |  | 3 to 9 |",
+        "| SearingSpotlights-v0, success | 0.0003 M | 0.01 | 0.25 ± 0.00 | 0.25 | 0.90 |  | 3 to 9 |",
         "| Endless-MortarMayhem-v0, carried_out | 8.192 M |  | 2.00 ± 0.00, 2 seeds |  |  | 120, 18 | 3 |",
     ]
 
