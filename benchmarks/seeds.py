@@ -36,19 +36,14 @@ def draw_seeds(results: dict[str, Runs], out: Path) -> None:
         task = TASKS[env_id]
         theirs = thesis.get(env_id, {})
         for column, (agent, runs) in enumerate(agents.items()):
-            for chose, fill in ((True, COLORS[agent]), (False, "none")):
+            for chose, fill, shift in ((True, COLORS[agent], 0), (False, "none", 0.25)):
                 dots = [run for run in runs if (int(run.args["seed"]) in CHOOSING_SEEDS) == chose]
                 scores = [float(tables.final_scores(task.score, [run]).mean()) for run in dots]
-                axis.plot(
-                    [column + (-0.12 if chose else 0.12)] * len(dots),
-                    scores,
-                    "o",
-                    color=COLORS[agent],
-                    markerfacecolor=fill,
-                    alpha=0.6,
-                )
+                style = {"color": COLORS[agent], "markerfacecolor": fill, "alpha": 0.6}
+                axis.plot([column + shift] * len(dots), scores, "o", **style)
             if level := theirs.get(agent.removesuffix("+")):
-                axis.plot(column, float(level.removeprefix("> ")), "k_", markersize=28, label="thesis")
+                style, size, label = ("k^", 7, "thesis: more") if level.startswith("> ") else ("k_", 28, "thesis")
+                axis.plot(column, float(level.removeprefix("> ")), style, markersize=size, label=label)
         axis.axhline(bounds[env_id].random, color="gray", linestyle=":", label="random actions")
         axis.axhline(bounds[env_id].scripted, color="gray", linestyle="--", label="scripted player")
         if task.best_score is None:
@@ -60,7 +55,7 @@ def draw_seeds(results: dict[str, Runs], out: Path) -> None:
     for fill, which in (("k", "settings were chosen by it"), ("none", "it chose nothing")):
         figure.axes[0].plot([], [], "ko", markerfacecolor=fill, label=f"a seed; {which}")
     handles = dict(zip(*reversed(figure.axes[0].get_legend_handles_labels()), strict=True))
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=5, frameon=False)
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
     figure.savefig(out, dpi=110)
 
 

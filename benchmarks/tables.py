@@ -28,7 +28,7 @@ BOUNDS, THESIS, NEW_LEVELS = (Path(__file__).with_name(f"{name}.csv") for name i
 ALPHA = 0.05  # significance level: agents differ if the p-value is below it
 SHOWN = ("show_origin", "show_goal")  # options that change how a level looks, not what it is
 RIVALS = ("no memory", "GRU")  # with which the others are compared over all tasks
-DIFFER_FROM = ("GRU", "16 frames")  # whom the others are compared with, all tasks tested at once
+DIFFER_FROM = ("GRU", "16 frames", "no memory")  # whom the others are compared with, all tasks tested at once
 NAMES_APART = 0.075  # between the names beside the curves' ends, as a share of the axis
 
 
@@ -195,6 +195,8 @@ def table(task: Task, agents: Runs) -> str:
         *(row(agent, runs_of, task, best) for agent in runs_of),
         f"\nRuns: {len(every_run)}, together {hours:.1f} hours without evaluations. Machines: {machines}",
     ]
+    if not read_new_levels().get((task.env_id, json.dumps(task.options)), np.ones(1, bool)).any():
+        lines.append("No test level is new: all begin as one of the training's, so that all count")
     untested = [agent for agent, runs in runs_of.items() if not are_tested(task.score, runs)]
     if 0 < len(untested) < len(runs_of):
         lines.append(f"On development levels, so not comparable with the others: {', '.join(untested)}")

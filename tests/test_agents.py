@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -10,9 +10,11 @@ import tyro
 
 import evaluate
 import learning
+import tables
 from ppo_utils.checkpoints import Checkpoint
 
 AGENTS = Path(__file__).parents[1] / "agents"
+RESULTS = Path(__file__).parents[1] / "benchmarks/results"
 ROWS = re.findall(r"^\| `(\S+)` \| (\w+) \| ([\d.]+) \| `python benchmarks/learning.py (.+)` \|$",
                   (AGENTS / "README.md").read_text(), re.MULTILINE)  # fmt: skip
 
@@ -40,3 +42,19 @@ def test_an_agent_plays_as_well_as_published(name, metric, score, flags):
     (planned,) = learning.plans_of(tyro.cli(learning.Config, args=shlex.split(flags))).values()
     assert learning.settings(asdict(planned.args)) == learning.settings(asdict(checkpoint.args))
     assert planned.args.exp_name == checkpoint.args.exp_name
+
+
+def test_what_agents_of_mystery_path_have_on_new_levels():
+    """As in the results; the page has the other levels in its table, too."""
+    found = {}
+    for name, metric, _, flags in ROWS:
+        if name.startswith("mystery-path"):
+            config = replace(tyro.cli(learning.Config, args=shlex.split(flags)), results=RESULTS)
+            (agents,) = learning.results_of(config, learning.plans_of(config)).values()
+            (runs,) = agents.values()
+            found[name.removesuffix(".pt")] = f"{tables.final_scores(metric, runs).mean():.2f}"
+    told = (
+        "GRU and TrXL+ have {mystery-path-grid-gru} and {mystery-path-grid-trxl} in its grid, {mystery-path-gru} and "
+        "{mystery-path-trxl} with free movement"
+    )
+    assert told.format_map(found) in " ".join((AGENTS / "README.md").read_text().split())

@@ -91,6 +91,7 @@ def test_agents_of_finite_mortar_mayhem_are_compared_by_what_they_carried_out():
     table = tables.table(task, {"slow": [slow], "fast": [fast]}).splitlines()
     assert "| slow | 0.75 | 0.75 | 0.75 |  | 0.00 | 3.0 |  | 3.0 |" in table
     assert "| fast | 1.00 | 1.00 | 1.00 |  | 0.00 | 2.0 | 2.0 | 3.0 |" in table
+    assert table[-1] == "No test level is new: all begin as one of the training's, so that all count"
 
 
 def test_a_table_leaves_out_agents_without_runs_and_compares_with_the_best():
