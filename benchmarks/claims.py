@@ -8,8 +8,8 @@ Tasks, runs and results are those of benchmarks/learning.py: small networks, vec
 A claim compares pairs of agents: each that is said to have the higher number (A in the table) with each that is said to
 have the lower one (B). A pair is decided as in the tables of results (`tables.Comparison`): by Welch's t-test over
 seeds and levels. The claim holds if all of its pairs are decided its way; it does not hold if one is decided the other
-way, with its p-value multiplied by the number of pairs; else it is not decided, and the table has the 95 % intervals
-of the differences that are not. Where the thesis says that agents are no better than others, it does not hold if one of
+way, with its p-value multiplied by the number of pairs; else it is not decided, and the table has the 95 % intervals of
+the differences that are open. Where the thesis says that agents are no better than others, it does not hold if one of
 them is ahead, with p as before, and is not decided else. Where no agent of a row scores higher than those without
 memory, or all have less than a quarter of what is possible (in endless tasks, of what the thesis' transformer has), or
 where falls are counted and one has less than nine tenths, the task has not been learned, and there is no verdict.
