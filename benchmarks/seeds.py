@@ -2,10 +2,10 @@
 
     python benchmarks/seeds.py
 
-docs/seeds.png has a panel for each task and a dot for each seed: the score of the final weights on new test levels.
-The dots of seeds that chose nothing are open. docs/endless.png has the curves of endless tasks on development levels,
-with steps on a logarithmic axis up to the thesis', docs/commands.png after how many commands episodes of Endless Mortar
-Mayhem end, which a table says, too.
+docs/seeds.png has a panel for each task and a dot for each seed: the score of the final weights on new test levels. The
+dots of seeds with which no settings were chosen are open. docs/endless.png has the curves of endless tasks on
+development levels, with steps on a logarithmic axis up to the thesis', docs/commands.png after how many commands
+episodes of Endless Mortar Mayhem end, which a table says, too.
 """
 
 import sys
@@ -37,13 +37,12 @@ def draw_seeds(results: dict[str, Runs], out: Path) -> None:
         theirs = thesis.get(env_id, {})
         for column, (agent, runs) in enumerate(agents.items()):
             for chose, fill, shift in ((True, COLORS[agent], 0), (False, "none", 0.25)):
-                dots = [run for run in runs if (int(run.args["seed"]) in CHOOSING_SEEDS) == chose]
-                scores = [float(tables.final_scores(task.score, [run]).mean()) for run in dots]
-                style = {"color": COLORS[agent], "markerfacecolor": fill, "alpha": 0.6}
-                axis.plot([column + shift] * len(dots), scores, "o", **style)
+                members = [run for run in runs if (int(run.args["seed"]) in CHOOSING_SEEDS) == chose]
+                scores = [float(tables.final_scores(task.score, [run]).mean()) for run in members]
+                axis.plot([column + shift] * len(scores), scores, "o", color=COLORS[agent], mfc=fill, alpha=0.6)
             if level := theirs.get(agent.removesuffix("+")):
-                style, size, label = ("k^", 7, "thesis: more") if level.startswith("> ") else ("k_", 28, "thesis")
-                axis.plot(column, float(level.removeprefix("> ")), style, markersize=size, label=label)
+                marker, size, label = ("k^", 7, "thesis: more") if level.startswith("> ") else ("k_", 28, "thesis")
+                axis.plot(column, float(level.removeprefix("> ")), marker, markersize=size, label=label)
         axis.axhline(bounds[env_id].random, color="gray", linestyle=":", label="random actions")
         axis.axhline(bounds[env_id].scripted, color="gray", linestyle="--", label="scripted player")
         if task.best_score is None:
@@ -52,8 +51,8 @@ def draw_seeds(results: dict[str, Runs], out: Path) -> None:
         axis.set_xlim(-0.5, len(AGENTS) - 0.5)
         axis.set_title(f"{env_id.removesuffix('-v0')}, {task.total_timesteps / 1e6:g} M", fontsize=9)
         axis.set_ylabel(task.score, fontsize=8)
-    for fill, which in (("k", "settings were chosen by it"), ("none", "it chose nothing")):
-        figure.axes[0].plot([], [], "ko", markerfacecolor=fill, label=f"a seed; {which}")
+    for fill, which in (("k", "that settings were chosen with"), ("none", "that they were not")):
+        figure.axes[0].plot([], [], "ko", markerfacecolor=fill, label=f"seed {which}")
     handles = dict(zip(*reversed(figure.axes[0].get_legend_handles_labels()), strict=True))
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
     figure.savefig(out, dpi=110)

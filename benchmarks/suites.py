@@ -108,7 +108,7 @@ SUITES = {  # tasks and agents
     "small": (SMALL, ("no memory", "4 frames", "16 frames", "GRU", "TrXL", "TrXL+")),
     "full": (FULL, ("no memory", "16 frames", "GRU", "TrXL+")),
 }
-SEEDS = (1, 2, 3, 4, 5)  # of the tables, where an agent has them all
+SEEDS = (1, 2, 3, 4, 5)  # of the tables; some agents have only the first three
 CHOOSING_SEEDS = SEEDS[:3]  # by which settings were chosen
 COLORS = {  # an agent has the same in every picture
     "no memory": "tab:gray",

@@ -195,8 +195,9 @@ def table(task: Task, agents: Runs) -> str:
         *(row(agent, runs_of, task, best) for agent in runs_of),
         f"\nRuns: {len(every_run)}, together {hours:.1f} hours without evaluations. Machines: {machines}",
     ]
-    if not read_new_levels().get((task.env_id, json.dumps(task.options)), np.ones(1, bool)).any():
-        lines.append("No test level is new: all begin as one of the training's, so that all count")
+    new = read_new_levels().get((task.env_id, json.dumps(task.options)))
+    if new is not None and not new.any() and any(are_tested(task.score, runs) for runs in runs_of.values()):
+        lines.append("No test level is new: each begins as one of the training's, so that all count")
     untested = [agent for agent, runs in runs_of.items() if not are_tested(task.score, runs)]
     if 0 < len(untested) < len(runs_of):
         lines.append(f"On development levels, so not comparable with the others: {', '.join(untested)}")
@@ -252,8 +253,8 @@ def overview(tasks: dict[str, Runs], bounds: dict[str, Bounds], thesis: dict[str
         few = f", {count(len(runs))}" if len(runs) < seeds[agent] else ""
         return mean_and_error(final_scores(task.score, runs)) + few
 
-    same = len(set(seeds.values())) == 1
-    headings = [name if same else f"{name} ({count(seeds[name])})" for name in names]
+    same = len({*seeds.values()} - {0}) == 1
+    headings = [name if same or not seeds[name] else f"{name} ({count(seeds[name])})" for name in names]
 
     theirs = ["thesis: GRU, TrXL"] if tasks.keys() & thesis.keys() else []
     header = ["task, score", "steps", "random", *headings, "scripted", *theirs, "minutes"]

@@ -45,7 +45,7 @@ def test_an_agent_plays_as_well_as_published(name, metric, score, flags):
 
 
 def test_what_agents_of_mystery_path_have_on_new_levels():
-    """As in the results; the page has the other levels in its table, too."""
+    """As the results of the commands in the table say."""
     found = {}
     for name, metric, _, flags in ROWS:
         if name.startswith("mystery-path"):
@@ -54,7 +54,7 @@ def test_what_agents_of_mystery_path_have_on_new_levels():
             (runs,) = agents.values()
             found[name.removesuffix(".pt")] = f"{tables.final_scores(metric, runs).mean():.2f}"
     told = (
-        "GRU and TrXL+ have {mystery-path-grid-gru} and {mystery-path-grid-trxl} in its grid, {mystery-path-gru} and "
-        "{mystery-path-trxl} with free movement"
+        "GRU and TrXL+ have {mystery-path-grid-gru} and {mystery-path-grid-trxl} in Mystery Path Grid, with free "
+        "movement {mystery-path-gru} and, after four times as many steps, {mystery-path-trxl} "
     )
     assert told.format_map(found) in " ".join((AGENTS / "README.md").read_text().split())
