@@ -51,8 +51,8 @@ def draw_seeds(results: dict[str, Runs], out: Path) -> None:
         axis.set_xlim(-0.5, len(AGENTS) - 0.5)
         axis.set_title(f"{env_id.removesuffix('-v0')}, {task.total_timesteps / 1e6:g} M", fontsize=9)
         axis.set_ylabel(task.score, fontsize=8)
-    for fill, which in (("k", "that settings were chosen with"), ("none", "that they were not")):
-        figure.axes[0].plot([], [], "ko", markerfacecolor=fill, label=f"seed {which}")
+    for fill, which in (("k", "seed that settings were chosen with"), ("none", "other seed")):
+        figure.axes[0].plot([], [], "ko", mfc=fill, label=which)
     handles = dict(zip(*reversed(figure.axes[0].get_legend_handles_labels()), strict=True))
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
     figure.savefig(out, dpi=110)
